@@ -153,7 +153,7 @@ def measure_stages(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> 
     unexplained = max((pair.unexplained for pair in pairs), default=0.0)
     speed = max((pair.speed for pair in pairs), default=0.0)
     moves = speed > STILL if vectors else changed > GATE_ABOVE
-    fade = max((abs(np.log2(pair.fade)) for pair in pairs), default=0.0)
+    fade = max((abs(float(np.log2(pair.fade))) for pair in pairs), default=0.0)
     fades = "the light of the whole picture changes by {:.2g} stops between frames" if fade else "no fade was found"
     changes = "{:.2%} of the picture changes its light between frames" + ("" if vectors else " (motion included)")
     outliers = "{:.2g} of the pixels stand alone far above their neighbours"
