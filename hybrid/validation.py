@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from flow.convention import SCALES, Choice, Trial, choose_convention
 from flow.guide import median_luminance, tone_map
 from flow.patches import FramePair, Patches
+from hybrid.alignment.measure import correlation
 from hybrid.files.frame import Array, Frame
 from hybrid.files.layers import Layers
 from hybrid.files.passes import NO_PASSES, Passes
@@ -26,6 +27,7 @@ from hybrid.files.shots import Shot
 from hybrid.grade import Grade, find_grade
 from hybrid.pass_sums import classify_passes, sample_rows
 from hybrid.runtime.kept import Keeper
+from nlm.variance import second_differences
 
 Mask = NDArray[np.bool_]
 
@@ -390,8 +392,8 @@ def _edges_of(colors: Sequence[Array]) -> list[Array]:
 
 def _match_edges(found: Sequence[Array], shown: Sequence[Array]) -> _EdgeMatch:
     """Correlate edges that were found with those of two frames; the better is the own, as dim frames match anything."""
-    centre = max(_correlate(found[0], shown[0]), _correlate(found[1], shown[1]))
-    return _EdgeMatch(centre, _correlate(found[1], shown[0]), _correlate(found[0], shown[1]))
+    centre = max(correlation(found[0], shown[0]), correlation(found[1], shown[1]))
+    return _EdgeMatch(centre, correlation(found[1], shown[0]), correlation(found[0], shown[1]))
 
 
 def _other_frame(edges: Sequence[_EdgeMatch]) -> str | None:
@@ -479,21 +481,13 @@ def _slope(layer: Array) -> Array:
     return np.asarray(np.sqrt(square if layer.ndim == 2 else np.einsum("yxc->yx", square)), np.float32)
 
 
-def _correlate(a: Array, b: Array) -> float:
-    a, b = a - a.mean(), b - b.mean()
-    power = float(np.sqrt(np.mean(a**2) * np.mean(b**2)))
-    return float(np.mean(a * b)) / power if power > 0 else 0.0
-
-
 def _variance_ratios(variance: Array, color: Array) -> Array:
     """Ratio of the variance to that of the picture, for patches of 9×9 pixels, of green alone.
 
-    The second difference in x of the second difference in y, [1 -2 1]ᵀ [1 -2 1] / 6, has the noise's own variance
-    (Immerkær 1996); texture makes it larger, so that flat patches are the most reliable.
+    Second differences over 6 have the noise's variance; texture makes it larger: flat patches are the most reliable.
     """
-    kernel = np.array([1, -2, 1], np.float32)
     green = np.nan_to_num(color[..., 1], posinf=0.0, neginf=0.0)
-    measured = cv2.blur((cv2.sepFilter2D(green, -1, kernel, kernel) / 6) ** 2, (9, 9))[4::9, 4::9]
+    measured = cv2.blur((second_differences(green) / 6) ** 2, (9, 9))[4::9, 4::9]
     given = cv2.blur(np.maximum(np.nan_to_num(variance[..., 1]), 0), (9, 9))[4::9, 4::9]
     lit = measured > 0
     return np.asarray(given[lit] / measured[lit], np.float32).ravel()

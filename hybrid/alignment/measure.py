@@ -236,7 +236,7 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool) -> fl
         d_b = b - channel_mean(_warp_block(here.irradiance, back[0], block))
         d = [_high_pass(image / (level + floor))[moved] for image in (d_a, d_b)]
         shares.append(int(moved.sum()))
-        figures.append(2 * _correlation(*d))
+        figures.append(2 * correlation(*d))
     return float(np.clip(np.average(figures, weights=shares), -1, 1)) if figures else 0.0
 
 
@@ -432,7 +432,8 @@ def _high_pass(image: Array) -> Array:
     return np.asarray(np.clip(noise, -limit, limit), np.float32)
 
 
-def _correlation(a: Array, b: Array) -> float:
+def correlation(a: Array, b: Array) -> float:
+    """Return the correlation of two arrays, in [-1, 1]; 0 if one is constant."""
     first, second = a - a.mean(), b - b.mean()
     power = float(np.sqrt(np.mean(first**2) * np.mean(second**2)))
     return float(np.mean(first * second)) / power if power > 0 else 0.0

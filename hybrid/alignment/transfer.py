@@ -196,9 +196,8 @@ def _find_greatest(bits: NDArray[np.uint32], rows: Places, columns: Places, lit:
 
 @njit(nogil=True, cache=True)
 def _bin_limited(
-    first: int, last: int, level: Array, rows: Places, columns: Places, lit: Mask, limit: np.float32,
-    sums: Doubles,
-) -> None:  # fmt: skip
+    first: int, last: int, level: Array, rows: Places, columns: Places, lit: Mask, limit: np.float32, sums: Doubles
+) -> None:
     """Sum in each lit bin the levels, each up to the limit."""
     for row in range(first, last):
         for y in range(rows[row], rows[row + 1]):

@@ -250,10 +250,7 @@ def _add_taps(red: Any, green: Any, blue: Any, above: Any, centre: Any, below: A
 
 
 @njit(cache=True, nogil=True)
-def _convolve_to_rgb(
-    first: int, stop: int, source: NDArray[Any], taps: Floats, bias: Floats,
-    image: Floats,
-) -> None:  # fmt: skip
+def _convolve_to_rgb(first: int, stop: int, source: NDArray[Any], taps: Floats, bias: Floats, image: Floats) -> None:
     height, row = source.shape
     width = image.shape[1]
     channels, low = row // width, np.uint32(32 - 8 * source.itemsize)
