@@ -62,6 +62,7 @@ def stage_layers(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:
     ``stage.network``: difference r of the result from the average a of first passes (else colors), |r − a| / (a +
     exposure).
     """
+    assert aligned.geometric_confidence is not None
     sides = [i for i, trust in enumerate(aligned.geometric_confidence) if i != aligned.centre and trust.any()]
     mean = average(aligned.color if aligned.first_pass is None else aligned.first_pass, aligned.confidence)
     changed = np.abs(irradiance - mean).mean(axis=-1) / (np.maximum(mean, 0).mean(axis=-1) + aligned.exposure)

@@ -52,18 +52,23 @@ DenoiseWindow = Callable[[AlignedWindow], Denoised]
 
 
 class Excess(NamedTuple):
-    """By how much a frame as rendered exceeds its picture.
+    """By how much a frame as rendered exceeds its picture, where it does so by much."""
 
-    Attributes
-    ----------
-    relative : (H, W) array
-        Relative to the picture plus the exposure.
-    bright : (H, W) bool array
-        The bright pixels of that (`nlm.moving_lights.find_bright`).
-    """
+    bright: Mask  # (H, W): the bright pixels (`nlm.moving_lights.find_bright`)
+    values: Array  # (K,): the excess at these, relative to the picture plus the exposure
 
-    relative: Array
-    bright: Mask
+    @classmethod
+    def of(cls, relative: Array) -> Excess:
+        """Keep the bright pixels of the excess (H, W): of most frames that is nothing."""
+        bright = find_bright(relative)
+        return cls(bright, relative[bright])
+
+    @property
+    def layers(self) -> tuple[Array, Mask]:
+        """The excess (H, W), 0 at pixels that are not bright, and the bright pixels."""
+        relative = np.zeros(self.bright.shape, np.float32)
+        relative[self.bright] = self.values
+        return relative, self.bright
 
 
 @dataclass(frozen=True)
@@ -191,8 +196,8 @@ class FrameDenoiser:
         for band in bands:
             assert window is not None
             # A function may stand for a denoiser.
-            ranged = getattr(self.denoise, "clamps", False)
-            aligned = align(window, band, ranged=ranged, timings=stream.timings)
+            ranged, guided = getattr(self.denoise, "clamps", False), getattr(self.denoise, "guided", True)
+            aligned = align(window, band, ranged=ranged, guided=guided, timings=stream.timings)
             if band is bands[-1]:
                 window = None  # frees its composed flows while the denoiser runs
             denoised = self.denoise(aligned)
@@ -296,9 +301,9 @@ class FrameDenoiser:
             for time in (-1, 1):
                 there = self._results.get(number + time * step)
                 if there is not None and there.passing is not None:
-                    passing[time] = there.passing, self._vectors(number, number + time * step)
+                    passing[time] = there.passing.layers, self._vectors(number, number + time * step)
             if own is not None and passing:
-                lights, (down, right) = passing_lights(*own, passing)
+                lights, (down, right) = passing_lights(*own.layers, passing)
                 seen = seen | lights
                 for time, ((_, bright), flow) in passing.items() if lights.any() else ():
                     trail |= trail_of(bright, (time * down, time * right), flow, self.stream.radius)
@@ -311,7 +316,7 @@ class FrameDenoiser:
         shown = [np.zeros_like(excess.bright)]
         for n in others if excess.bright.any() else ():
             if (other := self._excess_of(n, number)) is not None:
-                shown.append(confirmed_by_neighbour(*excess, *other, self._vectors(number, n)))
+                shown.append(confirmed_by_neighbour(*excess.layers, *other.layers, self._vectors(number, n)))
         if "stabilize" in self.stream.rules.allowed:
             seen = np.logical_or.reduce(shown)
         else:
@@ -332,8 +337,7 @@ class FrameDenoiser:
         if there is None or flow is None:
             return None
         picture, shown = warp(self._results[beside].denoised.color, flow.vectors)
-        relative = _excess(there, picture)[0].relative * shown
-        return Excess(relative, find_bright(relative))
+        return _excess(there, picture, inside=shown)[0]
 
     def _bands(self) -> list[slice]:
         height = self.stream.shot.shape[0]
@@ -369,14 +373,19 @@ def _needed(result: WindowResult, whole: bool) -> WindowResult:
     return result if whole else result.as_neighbour()
 
 
-def _excess(frame: PreparedFrame, picture: Array, neighbours: SampleMean | None = None) -> tuple[Excess, Excess | None]:
-    """By how much a frame as rendered exceeds its picture, and also its neighbours' samples where these are darker."""
+def _excess(
+    frame: PreparedFrame, picture: Array, neighbours: SampleMean | None = None, inside: Mask | None = None
+) -> tuple[Excess, Excess | None]:
+    """By how much a frame as rendered exceeds its picture, and also its neighbours' samples where these are darker.
+
+    0 where it is not `inside` (H, W).
+    """
     shown, rendered = channel_mean(picture), channel_mean(frame.rendered)
     light = shown + np.float32(measure_exposure(picture))
 
     def exceed(shown: Array) -> Excess:
-        relative = np.asarray((rendered - shown) / light * frame.valid, np.float32)
-        return Excess(relative, find_bright(relative))
+        counted = frame.valid if inside is None else frame.valid & inside
+        return Excess.of(np.asarray((rendered - shown) / light * counted, np.float32))
 
     if neighbours is None:
         return exceed(shown), None

@@ -283,9 +283,9 @@ def denoise_window(
             # In bfloat16 the skip connection takes two thirds of the memory of its inputs.
             return [model.encode_and_fuse(frames, shared), model.backbone.input_skip(static), average]
 
-        features, static, average = in_strips(encode, 2, torch.from_numpy(rows)[:, None], all_frames=True)
-        encoded, blend = model.decode(features, static)
-        del features, static
+        inputs = in_strips(encode, 2, torch.from_numpy(rows)[:, None], all_frames=True)
+        average = inputs.pop()
+        encoded, blend = model.decode(inputs.pop(0), inputs.pop(0))  # freed as they are used
     (top, _), (left, _) = borders
     encoded, blend, average = (x[..., top : top + height, left : left + width] for x in (encoded, blend, average))
 

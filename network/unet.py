@@ -86,18 +86,17 @@ class OidnUNet(nn.Module):
             (x,) = in_strips(lambda x, stage=stage: [halve(stage(x))], 2, x)
         return self.encoder[-1](x), skips
 
-    def decode(self, x: Tensor, skips: Sequence[Tensor], head: Callable[[Tensor], Sequence[Tensor]]) -> list[Tensor]:
+    def decode(self, x: Tensor, skips: list[Tensor], head: Callable[[Tensor], Sequence[Tensor]]) -> list[Tensor]:
         """Run the decoder, and a head on its finest features. Returns the head's outputs.
 
-        `x` and `skips` are those of `encode`; the first skip is the input of the network, not rounded, or its
-        `input_skip`. The head maps ``(N, width, H, W)`` features, or some of their rows, to outputs that depend on one
-        further row at most.
+        `x` and `skips` are those of `encode`, and no skip is left, so that features are freed as they are used; the
+        first skip is the input of the network, not rounded, or its `input_skip`. The head maps ``(N, width, H, W)``
+        features, or some of their rows, to outputs that depend on one further row at most.
         """
-        stages = (cast(Stage, stage) for stage in self.decoder)
-        *coarse, (finest, network_input) = zip(stages, reversed(skips), strict=True)
-        for stage, skip in coarse:
-            (x,) = in_strips(lambda x, skip, stage=stage: [stage.upsample(x, skip)], 2, x, skip)
-        return in_strips(lambda x, skip: head(finest.upsample(x, self.input_skip(skip))), 3, x, network_input)
+        *coarse, finest = (cast(Stage, stage) for stage in self.decoder)
+        for stage in coarse:
+            (x,) = in_strips(lambda x, skip, stage=stage: [stage.upsample(x, skip)], 2, x, skips.pop())
+        return in_strips(lambda x, skip: head(finest.upsample(x, self.input_skip(skip))), 3, x, skips.pop())
 
     def input_skip(self, x: Tensor) -> Tensor:
         """Skip connection from the network's input; in bfloat16 with the low bits of the color (`round_unet`)."""
@@ -211,7 +210,8 @@ def _run(
 
     def encode(*rows: Tensor) -> list[Tensor]:
         parts = [to_unit(layer) for layer, (_, to_unit) in zip(rows, layers, strict=True)]
-        return [functional.pad(torch.cat(parts, 1), (0, right))]
+        encoded = torch.cat(parts, 1)
+        return [functional.pad(encoded, (0, right)) if right else encoded]  # padding by nothing copies
 
     # In strips, so that intermediate results are small and stay in the caches.
     (x,) = in_strips(encode, 0, *(layer for layer, _ in layers))

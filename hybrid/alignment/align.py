@@ -47,7 +47,6 @@ class _Warped(NamedTuple):
 
     layers: dict[str, Array]  # (T, h, W, C) each
     confidence: Array  # (T, h, W)
-    coverage: Array  # (T, h, W), an upper bound of the confidence: 0 where a frame shows nothing
     trust: tuple[Trust | None, ...]
 
 
@@ -66,13 +65,18 @@ def _pad_rows(rows: slice | None, height: int) -> tuple[slice, slice]:
 
 
 def align(
-    window: Window, rows: slice | None = None, *, ranged: bool = False, timings: Timings | None = None
+    window: Window,
+    rows: slice | None = None,
+    *,
+    ranged: bool = False,
+    guided: bool = True,
+    timings: Timings | None = None,
 ) -> AlignedWindow:
     """Warp all frames of a window to its centre, and measure how far each pixel can be trusted.
 
     With `rows` only these rows of the frame, and `MARGIN` around them. With `ranged` the range of the samples is found
-    while they are averaged. All frames have the same layers (`expect_equal_layers`). Raises ValueError if the centre
-    has no first pass and others do.
+    while they are averaged; without `guided` nobody reads `AlignedWindow.guide`, but to filter AOVs. All frames have
+    the same layers (`expect_equal_layers`). Raises ValueError if the centre has no first pass and others do.
     """
     timings = timings or Timings()
     centre, stages, given = window.centre, window.stages, window.first_pass is not None
@@ -82,7 +86,7 @@ def align(
     guides = {name: layer for name, layer in layers.items() if name in ("albedo", "normal")}
     # With a first pass few denoisers read the colors of all frames: these are warped when they are read.
     own = layers.pop("color") if given else layers["color"]
-    warped = _warp_neighbours(window, layers, guides, padded, timings)
+    warped, coverage = _warp_neighbours(window, layers, guides, padded, timings)
     flows = [None if link is None else link.forward.vectors[padded] for link in window.links]
     sources = WarpSources(window.frames, flows, window.first_pass or (), window.limited, padded)
     with timings.stage("confidence"):
@@ -90,7 +94,7 @@ def align(
         clean = clean_guide("albedo", guides, sources, warped.confidence, stages) if "albedo" in guides else None
     estimates = None
     if window.first_pass is not None:
-        estimates = _warp_first_pass(window, window.first_pass, warped.coverage, padded, timings)
+        estimates = _warp_first_pass(window, window.first_pass, coverage, padded, timings)
     with timings.stage("confidence"):
         color, own = _fill_centre(warped, own, estimates, sources)
         bright = window.lit.as_light if "light" in warped.layers else window.lit.as_rendered
@@ -101,11 +105,14 @@ def align(
         modulation = np.ones_like(own)
         if clean is not None and centre.demodulated:
             modulation = remodulate(modulation, clean)
+        guided = guided or bool(centre.aovs)
+        clean = clean if guided else None
         confidence = warped.confidence
         if estimates is not None:
             # By the centre's albedo and not by each frame's own, which may be noisy as the first pass is not.
             estimates /= modulation
-            confidence = trust_light(confidence, warped.coverage, color_gate(estimates, own, bright.exposure), stages)
+            confidence = trust_light(confidence, coverage, color_gate(estimates, own, bright.exposure), stages)
+            del coverage  # windows are large
             if "gate" in stages:
                 agreement = agreement_weight(estimates, own, confidence, bright.exposure)
                 for neighbours in (confidence[:middle], confidence[middle + 1 :]):
@@ -134,7 +141,7 @@ def align(
         confidence=confidence,
         modulation=modulation,
         clean_albedo=clean,
-        geometric_confidence=warped.confidence,
+        geometric_confidence=warped.confidence if guided else None,
         rendered_variance=centre.variance,
         first_pass=estimates,
         centre_first_pass=None if window.first_pass is None else window.first_pass[middle],
@@ -241,8 +248,11 @@ def _names(frame: PreparedFrame) -> set[str]:
 
 def _warp_neighbours(
     window: Window, layers: dict[str, Array], guides: Collection[str], rows: slice, timings: Timings
-) -> _Warped:
-    """Warp the neighbours' layers to these rows of the centre. Guides serve the confidence alone and are not kept."""
+) -> tuple[_Warped, Array]:
+    """Warp the neighbours' layers to these rows of the centre. Guides serve the confidence alone and are not kept.
+
+    With the coverage (T, h, W), an upper bound of the confidence: 0 where a frame shows nothing.
+    """
     centre, count = window.centre, len(window.frames)
     shape = count, rows.stop - rows.start, centre.irradiance.shape[1]
     kept = {n: np.empty((*shape, layer.shape[-1]), np.float32) for n, layer in layers.items() if n not in guides}
@@ -260,7 +270,7 @@ def _warp_neighbours(
             warp_layers(there, link.forward.vectors[rows], rows, {name: layer[index] for name, layer in kept.items()})
             trust = trusts[index] = trust_geometry(layers, there, link, rows)
             _set_trust(confidence, coverage, window, index, trust, rows)
-    return _Warped(kept, confidence, coverage, tuple(trusts))
+    return _Warped(kept, confidence, tuple(trusts)), coverage
 
 
 def _set_trust(confidence: Array, coverage: Array, window: Window, index: int, trust: Trust, rows: slice) -> None:

@@ -2,9 +2,10 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self, TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flow.motion import Motion, invert_flow
 from hybrid.alignment.transfer import ALBEDO_FLOOR, compress, demodulate, measure_exposure, remodulate
@@ -16,6 +17,8 @@ from loops.parallel import Doubles, Mask, Places
 from nlm.average import reject_outliers, replace_nonfinite
 from nlm.fireflies import Highlights, add_highlights
 from nlm.guided import guided_filter, measure_guide
+
+Values = TypeVar("Values", bound=NDArray[Any])
 
 # Name of the alpha channel among the AOVs; unlike the others it is no light, and is not demodulated.
 ALPHA = "alpha"
@@ -163,24 +166,32 @@ def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
         variance = None if variance is None else demodulate(demodulate(variance, albedo), albedo)
         aovs = {name: demodulate(layer, albedo) if name in passes.textured else layer for name, layer in aovs.items()}
     motion = frame.flows()
+    if motion is not None:
+        motion = Motion(*(way and way._replace(valid=_one_value(way.valid)) for way in motion))
     one_way = motion is not None and (motion.to_previous is None or motion.to_next is None)
     return PreparedFrame(
         number=frame.number,
         irradiance=color,
         albedo=albedo,
         normal=normal,
-        valid=~bad,
+        valid=_one_value(~bad),
         repaired=int(np.count_nonzero(repaired)),
         motion=motion,
         depth=frame.depth if one_way else None,
         variance=None if variance is None else np.maximum(variance, 0),
-        alpha=None if frame.alpha is None else replace_nonfinite(frame.alpha[..., None])[0],
+        alpha=None if frame.alpha is None else _one_value(replace_nonfinite(frame.alpha[..., None])[0]),
         aovs=aovs,
         demodulated=demodulated,
         unfiltered=unfiltered,
         pass_colors=pass_colors,
         passes=passes,
     )
+
+
+def _one_value(layer: Values) -> Values:
+    """A layer, in the memory of one pixel where all are equal, as where every pixel is opaque or valid."""
+    first = layer[:1, :1].copy()
+    return cast(Values, np.broadcast_to(first, layer.shape)) if (layer == first).all() else layer
 
 
 def prepared_planes(layers: Layers) -> float:

@@ -127,8 +127,10 @@ class AlignedWindow:
     sources: WarpSources  # the frames and flows, for layers that are warped when they are read
     confidence: Array  # (T, H, W), in [0, 1]; the centre's is 1 wherever its own color was finite
     modulation: Array  # (H, W, 3): radiance of an irradiance of 1: the centre's prefiltered albedo plus the floor, or 1
-    clean_albedo: Array | None  # (H, W, 3): the centre's albedo, prefiltered where the plan has it
-    geometric_confidence: Array  # (T, H, W): confidence by geometry alone, with which guides are prefiltered
+    # (H, W, 3): the centre's albedo, prefiltered where the plan has it; None also where nobody reads the `guide`
+    clean_albedo: Array | None
+    # (T, H, W): confidence by geometry alone, with which guides are prefiltered; None where nobody reads the `guide`
+    geometric_confidence: Array | None
     rendered_variance: Array | None  # (H, W, 3), of the centre's irradiance, where the file has one
     # (T, H, W, 3): the first pass, aligned, as irradiance; the centre's where a frame shows nothing, pulled to it where
     # the light drifts
@@ -180,6 +182,7 @@ class AlignedWindow:
         """The centre's albedo and normal, prefiltered, (H, W, G). Made at the first access."""
         clean = [] if self.clean_albedo is None else [self.clean_albedo]
         if "normal" in self.guides:
+            assert self.geometric_confidence is not None
             clean.append(clean_guide("normal", self.guides, self.sources, self.geometric_confidence, self.stages))
         return np.concatenate(clean, axis=-1) if clean else None
 

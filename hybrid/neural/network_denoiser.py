@@ -91,19 +91,22 @@ class NetworkDenoiser(WindowDenoiser):
     def _run(self, aligned: AlignedWindow, window: Any, aovs: Array, black: bool = False) -> Result:
         """Run the network tile by tile; `aovs` are the centre's (H, W, C), used where nothing varies or is lit."""
         frames, height, width = aligned.confidence.shape
-        # Rows without tiles are not read.
-        irradiance, filtered = np.zeros_like(aligned.centre_irradiance), np.empty_like(aovs)
+        filtered, irradiance = np.empty_like(aovs), np.empty((0, 0, 3), np.float32)
         parts = None if self.setup.breakdown is None else np.zeros((frames, height, width, 4), np.float32)
         for inner, outer, offset in tiles(aligned.inner, height, width, self.tile, self.halo, self.model.multiple):
             # Without variance in time and space, not even by rounding, the pixel is the mean.
-            if black or ("skip" in aligned.stages and not aligned.variance[outer].any()):
+            skipped = black or ("skip" in aligned.stages and not aligned.variance[outer].any())
+            with torch.inference_mode():
+                tile = None if skipped else self._run_tile(aligned, window, outer)
+            if not irradiance.size:  # not before: while a network runs, memory is at its fullest
+                irradiance = np.zeros_like(aligned.centre_irradiance)  # rows without tiles are not read
+            if tile is None:
                 irradiance[inner], filtered[inner] = aligned.centre_irradiance[inner], aovs[inner]
                 if parts is not None:
                     weight = np.ones_like(irradiance[inner][..., :1])
                     parts[aligned.centre][inner] = np.dstack([irradiance[inner], weight])
                 continue
             with torch.inference_mode():
-                tile = self._run_tile(aligned, window, outer)
                 irradiance[inner] = image_of(tile.irradiance)[offset]
                 if tile.aovs is not None:
                     filtered[inner] = image_of(tile.aovs)[offset]

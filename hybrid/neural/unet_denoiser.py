@@ -31,6 +31,7 @@ class UNetDenoiser(NetworkDenoiser):
 
     def __init__(self, model: RobustUNet, setup: Setup) -> None:
         super().__init__(for_inference(model, setup.bfloat16), setup, SCRATCH[model.config.size])
+        self.guided = setup.breakdown is not None or (model.config.clean_guides and not has_oidn_networks())
 
     def __call__(self, aligned: AlignedWindow) -> Denoised:
         if aligned.first_pass is None or aligned.centre_first_pass is None:
