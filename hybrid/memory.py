@@ -25,9 +25,9 @@ CODE = 64 * 2**20  # the part of it that stays when OIDN has run
 # Share of the limit that is planned for; the allocator rounds up, and does not return all memory at once: at 960×540
 # the peak is 4 % above the plan.
 SHARE = 0.94
-# Temporary planes while rows of a window are filtered, while a network reads them, and while samples correct a finished
-# picture.
-FILTERING, GIVING, FINISHING = 40, 30, 38
+# Temporary planes while rows of a window are filtered, while they are aligned for a network, while it reads them, and
+# while samples correct a finished picture.
+FILTERING, ALIGNING, GIVING, FINISHING = 40, 24, 20, 38
 # Planes that exist while pairs of frames are compared before a run: 4.9 GiB at 7680×4320, while the second is read.
 VALIDATING = 38
 # Temporary planes while TV-L1 solves for a flow.
@@ -80,7 +80,7 @@ def plan_memory(
     passing = max(reading, REFINING if can_refine(stages) else 0)
     # A first pass made of windows is filtered beside a network too.
     filtered = not neural or (first_pass is not None and first_pass.from_noisy)
-    worked = _worked_planes(layers, 2 * radius + 1, filtered)
+    worked, aligned = _worked_planes(layers, 2 * radius + 1, filtered)
     plane = 4 * height * width
     base, code = (BASE_NEURAL, OIDN_NEURAL) if neural else (BASE, OIDN)
     holds = 0 if first_pass is None else first_pass.holds
@@ -94,7 +94,7 @@ def plan_memory(
         share = outer / height
         # The rows that are worked on are read from files.
         held, read = (0.0, kept * share) if in_files else (kept, 0.0)
-        working = plane * (worked * share + read) + (network((outer, width)) or 0)
+        working = max(plane * worked * share + (network((outer, width)) or 0), plane * aligned * share) + plane * read
         # A first pass is made while frames are prepared; pooled samples are denoised while rows are worked on.
         working += oidn if pools else min(oidn, CODE)
         at_once = max(plane * passing + oidn, plane * FINISHING, working)
@@ -115,10 +115,11 @@ def plan_memory(
     return MemoryPlan(rows, True)
 
 
-def _worked_planes(layers: Layers, frames: int, filtered: bool) -> float:
-    """Count the float32 planes of an aligned window of so many frames, and of what reads it."""
+def _worked_planes(layers: Layers, frames: int, filtered: bool) -> tuple[float, float]:
+    """Count the float32 planes of an aligned window of so many frames, with what reads it, and while it is aligned."""
     if filtered:
-        return 2.0 * frames * aligned_planes(layers) + FILTERING
+        return 2.0 * frames * aligned_planes(layers) + FILTERING, 0.0
     # A network reads the first pass, confidences and AOVs alone.
     aovs = sum(len(layer.channels) for layer in layers.aovs.values()) + (layers.alpha is not None)
-    return frames * (7 + 2.0 * aovs) + GIVING
+    # While it is aligned, also the confidence by geometry and the weights of drift.
+    return frames * (4 + 2.0 * aovs) + GIVING, frames * (6 + 2.0 * aovs) + ALIGNING

@@ -331,7 +331,7 @@ def kept_planes(shot: Shot, stages: Collection[str], first_pass: FirstPass | Non
     frames = min(2 * support + 1 + (REACH if "fireflies" in stages else 0), len(shot.files))
     results = 2 if "stabilize" in stages else 1
     # With the neighbours' samples, trust, drift and excess; of a third result the color is left.
-    written = 3 + sum(len(layer.channels) for layer in layers.aovs.values()) + (layers.alpha is not None) + 11
+    written = 3 + sum(len(layer.channels) for layer in layers.aovs.values()) + (layers.alpha is not None) + 10
     pictures = results * written + 4 * (results - 1)
     return frames * prepared_planes(layers) + _flow_planes(layers, stages, frames, radius) + pictures
 

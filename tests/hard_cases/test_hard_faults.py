@@ -436,9 +436,9 @@ PEAKS = [
     ((540, 960), None, 0, 0.81),
     ((540, 960), None, HOLDS, 1.17),  # with --estimate oidn-best
     ((540, 960), None, HOLDS_FAST, 0.76),  # with --estimate oidn-fast
-    ((180, 320), 100, 0, 0.51),  # denoise --preset fast
-    ((540, 960), 100, 0, 1.07),
-    ((1080, 1920), 100, 0, 2.47),
+    ((180, 320), 100, 0, 0.50),  # denoise --preset fast
+    ((540, 960), 100, 0, 0.90),
+    ((1080, 1920), 100, 0, 2.03),
 ]
 
 
