@@ -58,7 +58,7 @@ class Excess(NamedTuple):
     values: Array  # (K,): the excess at these, relative to the picture plus the exposure
 
     @classmethod
-    def of(cls, relative: Array) -> Excess:
+    def of(cls, relative: Array) -> Self:
         """Keep the bright pixels of the excess (H, W): of most frames that is nothing."""
         bright = find_bright(relative)
         return cls(bright, relative[bright])

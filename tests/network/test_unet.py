@@ -84,6 +84,15 @@ def test_any_size(made_up: OidnUNet, size: tuple[int, int]) -> None:
     assert result.shape == (1, 3, *size)
 
 
+def test_features_are_freed_as_they_are_used(made_up: OidnUNet) -> None:
+    """Those at half the size, the largest, stayed in memory while the finest scale of the decoder ran."""
+    with torch.inference_mode():
+        bottleneck, skips = made_up.encode(torch.rand(1, made_up.config.inputs, 32, 32))
+        left: list[int] = []
+        made_up.decode(bottleneck, skips, lambda features: left.append(len(skips)) or [features])  # type: ignore[func-returns-value]
+    assert left == [0]
+
+
 def test_running_gives_what_training_sees(made_up: OidnUNet) -> None:
     """Without gradients sums are taken in another order (`network.cpu.upsample_conv`)."""
     picture = torch.rand(2, 9, 48, 32, generator=torch.Generator().manual_seed(3))

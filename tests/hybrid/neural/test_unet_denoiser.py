@@ -64,6 +64,13 @@ def test_only_a_network_that_relies_on_clean_guides_gets_them(preset, tmp_path, 
     assert bool(seen) == (preset == "quality")
 
 
+def test_a_window_is_guided_where_the_network_reads_its_guide(monkeypatch):
+    """Its confidence by geometry and its clean albedo took eight planes that no other network reads."""
+    for has, preset, guided in ((True, "quality", False), (False, "quality", True), (False, "fast", False)):
+        monkeypatch.setattr(unet_denoiser, "has_oidn_networks", lambda has=has: has)
+        assert open_network(shipped_weights(preset)).guided == guided
+
+
 def test_the_network_gets_limited_residuals():
     """Those of bright samples, with the light that the limit takes spread around them."""
     asked = []
@@ -86,6 +93,7 @@ def test_residuals_are_made_once_for_the_samples_and_once_for_the_network(tmp_pa
         return residual(sources, *part, limited=limited)
 
     monkeypatch.setattr(WarpSources, "residual", count)
+    monkeypatch.setattr("network.strips.ROWS", 400)  # all in one strip
     stream = FrameStream(open_shot(SCENE.write(tmp_path)), only({"warp", "blend-samples"}), first_pass=Classical(DRAFT))
     FrameDenoiser(stream, open_network(shipped_weights("fast"))).make(SCENE.first + 2)
     assert sorted(made) == [False, True]
