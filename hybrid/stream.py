@@ -15,7 +15,16 @@ from flow.tvl1 import refine_flow
 from hybrid.alignment.align import align, expect_equal_layers
 from hybrid.alignment.fireflies import REACH, remove_fireflies
 from hybrid.alignment.flows import Flow, Link, PairFlows, compose_flows, measure_flows
-from hybrid.alignment.measure import FrameFacts, PairFacts, SmallFrame, measure_frame, measure_pair, shrink
+from hybrid.alignment.measure import (
+    FrameFacts,
+    PairFacts,
+    SmallFrame,
+    measure_frame,
+    measure_pair,
+    relit,
+    scaled,
+    shrink,
+)
 from hybrid.alignment.prepare import PreparedFrame, prepare, prepared_planes
 from hybrid.alignment.residual import Limited, measure_limited
 from hybrid.alignment.unfiltered import find_region, mirror_region
@@ -28,7 +37,6 @@ from hybrid.runtime.kept import Keeper
 from hybrid.runtime.timing import Timings
 
 Value = TypeVar("Value")
-Shown = TypeVar("Shown", PreparedFrame, PreparedFrame | None, Array | None)
 
 # A frame with less than this share of another's light is black beside it: half floats hold no more of it.
 FAINT = 1e-6
@@ -201,8 +209,15 @@ class FrameStream:
             n != number and self._repeats(n, n + (self.shot.step if n < number else -self.shot.step)) for n in numbers
         )
         fades = [self._fade(n, number, plan.stages) for n in numbers]
-        frames = tuple(map(self._relit, frames, fades))
-        denoised = denoised and tuple(map(self._relit, denoised, fades))
+        centre = self._there(number)
+        frames = tuple(
+            frame if frame is None or fade == 1 else self.keeper.keep(relit(frame, fade, centre))
+            for frame, fade in zip(frames, fades, strict=True)
+        )
+        denoised = denoised and tuple(
+            picture if picture is None or fade == 1 else self.keeper.keep(picture * np.float32(fade))
+            for picture, fade in zip(denoised, fades, strict=True)
+        )
         return Window(frames, links, denoised, plan.stages, repeated, tuple(refined))
 
     def _composed(
@@ -302,20 +317,16 @@ class FrameStream:
         fade = fade if number < centre else 1 / fade
         return fade if FAINT < fade < 1 / FAINT else 1.0
 
-    def _relit(self, shown: Shown, fade: float) -> Shown:
-        """A frame, or the picture of one, with `fade` times its light."""
-        if shown is None or fade == 1:
-            return shown
-        return self.keeper.keep(shown.relit(fade) if isinstance(shown, PreparedFrame) else shown * np.float32(fade))
-
     def _measure_flows(self, earlier: int, later: int) -> PairFlows:
         plan, facts = self.plan([earlier, later]), self._pair_facts(earlier, later)
         if facts.cut:
             return PairFlows(None, None)
         stages = plan.stages - {"warp"} if facts.repeated else plan.stages
-        relit = self._relit(self._there(later), self._fade(later, earlier, stages))
+        here, fade = self._there(earlier), self._fade(later, earlier, stages)
+        there = self._there(later)
+        there = there if fade == 1 else scaled(there, fade)
         with self.timings.stage("flow"):
-            return measure_flows(self._there(earlier), relit, stages, self._refine)
+            return measure_flows(here, there, stages, self._refine)
 
     def _there(self, number: int) -> PreparedFrame:
         frame = self.frame(number)

@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from hybrid.alignment.measure import MOVED_NOISE, equal_noise, repeats, same_noise_at
+from hybrid.alignment.measure import MOVED_NOISE, NEAR, SAME, equal_noise, measure_fade, repeats, same_noise_at, scaled
 from hybrid.alignment.prepare import PreparedFrame, rendered_flow
 from hybrid.runtime.timing import Timings
 from loops.parallel import Mask, Places
@@ -68,7 +68,7 @@ def _find_highlights(
     still = np.zeros_like(centre.points)
     moved, last = {-1: still, 1: still}, {-1: frame, 1: frame}
     found: list[tuple[Highlights, Points, Mask]] = []
-    compared = [(frame, still)]
+    compared, equal = [(frame, still)], SAME
     for distance, side in product(range(1, REACH + 1), (-1, 1)):
         undecided = (shown == asked) & (asked < WITNESSES)
         if side not in moved or not (distance == 1 or undecided.any()):
@@ -80,14 +80,20 @@ def _find_highlights(
         with timings.stage("prepare"):
             moved[side] = moved[side] + _motion(last[side], there, nearest_pixel(centre.points + moved[side]))
             last[side] = there
+            fade = measure_fade(there.irradiance, frame.irradiance, frame.valid & there.valid)
+            if fade != 1:
+                there, equal = scaled(there, fade), NEAR
             pixels = follow_motion(centre, moved[side])
             lights = measure_highlights(there.irradiance, pixels, there.divisor_at)
+            # A lamp fades with the picture or stays as it is.
+            off, unlit = (np.abs(light - centre.light).sum(axis=1) for light in (lights.light, lights.light / fade))
+            lights = replace(lights, light=np.where((unlit < off)[:, None], lights.light / fade, lights.light))
             fresh = np.isfinite(lights.light).all(axis=1)
             for other, before in compared:
-                fresh &= not repeats(other.irradiance, there.irradiance)
+                fresh &= not repeats(other.irradiance, there.irradiance, equal)
                 unmoved = np.abs(moved[side] - before).max(axis=1) < MOVED_NOISE
                 if unmoved.any():
-                    noise = equal_noise(other.irradiance, there.irradiance)
+                    noise = equal_noise(other.irradiance, there.irradiance, equal)
                     fresh = fresh & ~(unmoved & same_noise_at(*noise, pixels))
             if distance == 1:
                 alone &= ~(fresh & recurs_nearby(places, frame.irradiance, pixels, there.irradiance))

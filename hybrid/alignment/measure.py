@@ -104,6 +104,11 @@ class SmallFrame:
         irradiance, light = (remodulate(layer, self.albedo) for layer in (self.irradiance, self.light))
         return replace(self, irradiance=irradiance, light=light, albedo=None)
 
+    def relit(self, fade: float) -> Self:
+        """Return the frame with `fade` times its light."""
+        irradiance, light = (layer * np.float32(fade) for layer in (self.irradiance, self.light))
+        return self if fade == 1 else replace(self, irradiance=irradiance, light=light)
+
 
 # `cv2.remap`, faster than `flow.warp`, refuses images of more pixels on a side.
 REMAPPED = 32766
@@ -150,6 +155,10 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
         speed = float(np.quantile(np.hypot(flow[..., 0], flow[..., 1]), 0.999))
     reduced = None if vectors is None else _reduced(vectors, smalls[0])
     fade = _fade(*smalls, reduced)
+    alike = smalls[0], smalls[1].relit(1 / fade)
+    differ = changed if fade == 1 else _changed(alike[0].textured(), alike[1].textured(), None)
+    lit, same = (there, SAME) if fade == 1 else (scaled(there, 1 / fade), NEAR)
+    cut = differ > CUT and _is_cut(here, there, alike, vectors)
     unexplained = changed if reduced is None else _changed(*smalls, reduced)
     return PairFacts(
         numbers=(here.number, there.number),
@@ -157,11 +166,11 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
         speed=speed,
         changed=changed,
         unexplained=max(unexplained, _changed_areas(*smalls, reduced)),
-        fixed_noise=fixed_noise(here, there, moves=changed > 0),
+        fixed_noise=fixed_noise(here, lit, moves=changed > 0, same=same),
         guide_noise=_guide_noise(here, there, vectors, smalls[0].factor),
-        cut=changed > CUT and fade == 1 and _is_cut(here, there, smalls, vectors),
-        repeated=repeats(here.irradiance, there.irradiance),
-        fade=fade,
+        cut=cut,
+        repeated=repeats(here.irradiance, lit.irradiance, same),
+        fade=1.0 if cut else fade,
     )
 
 
@@ -195,7 +204,7 @@ def _guides(here: PreparedFrame, there: PreparedFrame) -> list[tuple[Array, Arra
     return [(guide, other) for guide, other in pairs if guide is not None and other is not None]
 
 
-def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool) -> float:
+def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool, same: float = SAME) -> float:
     """Measure the share of the noise of two neighbours that is the same at equal pixels, in [-1, 1]; 0 without noise.
 
     With `moves` the picture changes at equal pixels: without vectors, motion is then searched for.
@@ -227,10 +236,10 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool) -> fl
     compared = still & grainy
     if compared.any():
         distance, greater = np.abs(a - b)[compared], np.maximum(np.abs(a), np.abs(b))[compared]
-        same, near = (np.count_nonzero(distance <= share * greater) for share in (SAME, NEAR))
+        equal, near = (np.count_nonzero(distance <= share * greater) for share in (same, NEAR * same / SAME))
         shares.append(distance.size)
         # Noise of a thousandth makes as many halves equal by chance as half of those one step apart.
-        figures.append((same - (near - same) / 2) / distance.size)
+        figures.append((equal - (near - equal) / 2) / distance.size)
     if moved.sum() > CROP and forth is not None and back is not None:
         d_a = a - channel_mean(_warp_block(there.irradiance, forth[0], block))
         d_b = b - channel_mean(_warp_block(here.irradiance, back[0], block))
@@ -240,28 +249,28 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool) -> fl
     return float(np.clip(np.average(figures, weights=shares), -1, 1)) if figures else 0.0
 
 
-def equal_noise(here: Array, there: Array) -> tuple[Array, Array]:
+def equal_noise(here: Array, there: Array, same: float = SAME) -> tuple[Array, Array]:
     """Find pixels at which two frames (H, W, 3) have noise or detail, and those at which it is the same sample.
 
     The first (H, W) is 1 where both differ from the median of 5×5 pixels by more than 2^-8 of their value, else 0; the
-    second is 1 where they are also equal, as half floats.
+    second is 1 where they are also equal, as half floats; in a fade that is up to `NEAR`, as both are rounded.
     """
     a, b = channel_mean(here), channel_mean(there)
     most = np.maximum(np.abs(a), np.abs(b))
     grain = np.minimum(*(np.abs(image - cv2.medianBlur(image, 5)) for image in (a, b)))
     grainy = grain > GRAIN * most
-    return grainy.astype(np.float32), (grainy & (np.abs(a - b) <= SAME * most)).astype(np.float32)
+    return grainy.astype(np.float32), (grainy & (np.abs(a - b) <= same * most)).astype(np.float32)
 
 
-def repeats(here: Array, there: Array) -> bool:
+def repeats(here: Array, there: Array, same: float = SAME) -> bool:
     """Return whether a frame (H, W, 3) repeats another, by `equal_noise`; False if hardly any pixel has detail."""
     height, size, grainy, equal = len(here), here.shape[0] * here.shape[1], 0, 0
     for top in range(0, height, NOISE_ROWS):
         # With the two rows on each side that a median of 5×5 pixels reads.
         first, last = max(top - 2, 0), min(top + NOISE_ROWS, height)
-        found, same = equal_noise(here[first : last + 2], there[first : last + 2])
+        found, alike = equal_noise(here[first : last + 2], there[first : last + 2], same)
         grainy += int(np.count_nonzero(found[top - first : last - first]))
-        equal += int(np.count_nonzero(same[top - first : last - first]))
+        equal += int(np.count_nonzero(alike[top - first : last - first]))
         if grainy - equal > (1 - REPEATED) * size:  # too many already, whatever follows
             return False
     return bool(grainy >= FEW and equal >= REPEATED * grainy)
@@ -292,31 +301,56 @@ def _changed(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | 
 
 
 def _fade(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | None) -> float:
-    """Median light of the second of two frames over that of the first, along `vectors`; 1 where that explains little.
-
-    Changes are medians of logarithms in 4×6 areas of the lit part, which average noise. A fade that leaves less than
-    half of them, or a quarter of slight ones, is one of the whole picture: on rendered shots of 8 to 512 samples 0.56
-    to 1.5 are left where light moves, and 0.04 to 0.5 of fades by 0.7.
-    """
+    """Factor of light from the first of two frames to the second, along `vectors`; 1 where none explains the change."""
     other, known = there.light, here.valid & there.valid
     if vectors is not None:
         other, inside = warp(there.light, vectors[0])
         known = here.valid & inside & vectors[1]
-    first, second = channel_mean(here.light), channel_mean(other)
+    return _factor(channel_mean(here.light), channel_mean(other), known)
+
+
+def _factor(first: Array, second: Array, known: Mask) -> float:
+    """Median of the second of two images (H, W) over the first, where `known`; 1 where that explains little.
+
+    Changes are medians of logarithms in 4×6 areas of the lit part, which average noise. A factor that leaves less than
+    half of them, or a quarter of slight ones, in three quarters of the areas is one of the whole picture: on rendered
+    shots of 8 to 512 samples 0.59 to 1.2 are left where light moves, and of fades by 0.7 less than half in 73 of 80.
+    """
     lit = known & (np.minimum(first, second) > NO_LIGHT)
     if not lit.any():
         return 1.0
-    change = np.log(np.divide(second, first, out=np.ones_like(first), where=lit))
+    change = np.log(np.where(lit, second, 1)) - np.log(np.where(lit, first, 1))
     extent = tuple(slice(*np.flatnonzero(lit.any(axis=axis))[[0, -1]] + (0, 1)) for axis in (1, 0))
     change, lit = change[extent], lit[extent]
     strips = zip(np.array_split(change, 4), np.array_split(lit, 4), strict=True)
     parts = [zip(*(np.array_split(half, 6, axis=1) for half in strip), strict=True) for strip in strips]
     areas = np.array([np.median(part[known]) for row in parts for part, known in row if known.any()])
-    fade = np.median(areas)
-    most = 0.25 if abs(fade) < SLIGHT else 0.5
-    if len(areas) < 6 or np.median(np.abs(areas - fade)) >= most * np.median(np.abs(areas)):
-        return 1.0
-    return float(np.exp(fade))
+    factor = np.median(areas)
+    most = 0.25 if abs(factor) < SLIGHT else 0.5
+    left, change = (np.quantile(np.abs(areas - middle), 0.75) for middle in (factor, 0))
+    return float(np.exp(factor)) if len(areas) >= 6 and left < most * change else 1.0
+
+
+def measure_fade(frame: Array, centre: Array, valid: Mask) -> float:
+    """Factor of light from one layer (H, W, C) to another, at equal pixels; 1 where none explains the change."""
+    step = max(min(valid.shape) // SHORT_SIDE, 1)
+    first, second = (channel_mean(np.ascontiguousarray(layer[::step, ::step])) for layer in (frame, centre))
+    return _factor(first, second, valid[::step, ::step])
+
+
+def scaled(frame: PreparedFrame, fade: float) -> PreparedFrame:
+    """Return a frame with `fade` times its light, but for its AOVs."""
+    factor = np.float32(fade)
+    variance = None if frame.variance is None else np.asarray(frame.variance * factor * factor)
+    return replace(frame, irradiance=np.asarray(frame.irradiance * factor), variance=variance)
+
+
+def relit(frame: PreparedFrame, fade: float, centre: PreparedFrame) -> PreparedFrame:
+    """Return a frame with `fade` times its light, as a neighbour of the centre; AOVs by the factors of their own."""
+    valid = frame.valid & centre.valid
+    fades = {name: measure_fade(layer, centre.aovs[name], valid) for name, layer in frame.aovs.items()}
+    aovs = {name: layer * np.float32(fades[name]) for name, layer in frame.aovs.items()}
+    return replace(scaled(frame, fade), aovs=aovs)
 
 
 def _changed_areas(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | None) -> float:

@@ -1,8 +1,8 @@
 """Prepared frames: finite, divided by their albedo, with the renderer's vectors in our convention."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple, Self, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,14 +60,6 @@ class PreparedFrame:
     # persistent highlights: lights of a pixel that other frames show as well, averaged over these frames. They are not
     # in `irradiance`, and are added to the finished picture.
     highlights: Highlights | None = None
-
-    def relit(self, fade: float) -> Self:
-        """Return the frame with `fade` times its light, as a neighbour of a frame with that much more light."""
-        parts = {name for found in self.passes.sums for name in (*found.parts, found.whole)}
-        lights, factor = parts | {*self.passes.textured, *self.pass_colors}, np.float32(fade)
-        aovs = {name: layer * factor if name in lights else layer for name, layer in self.aovs.items()}
-        variance = None if self.variance is None else self.variance * factor * factor
-        return replace(self, irradiance=self.irradiance * factor, variance=variance, aovs=aovs)
 
     @cached_property
     def light(self) -> Array:

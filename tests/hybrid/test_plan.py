@@ -6,7 +6,7 @@ import pytest
 from hybrid.files.shots import open_shot
 from hybrid.plan import DENOISED, NOISY, STAGES, Context, Rules, merge
 from hybrid.stream import FrameStream, plan_shot
-from tests.scenes import Scene, only
+from tests.scenes import Scene, grained, only
 
 
 def decisions(folder):
@@ -246,3 +246,74 @@ def test_light_of_pixels_without_vectors_is_no_fade(tmp_path):
 
     stream = FrameStream(open_shot(Scene(height=64, width=96).write(tmp_path, edit=blink)), Rules(), radius=1)
     assert [pair.fade for pair in stream.measurements([1001, 1002, 1003])[1]] == [1, 1]
+
+
+def test_light_of_three_fifths_of_a_picture_is_no_fade(tmp_path):
+    def blink(index, layers):
+        layers["ViewLayer.Combined"][:, :58] *= np.float32(1.5 ** (index % 2))
+
+    stream = FrameStream(open_shot(Scene(height=64, width=96, step=(0, 0)).write(tmp_path, edit=blink)), Rules())
+    assert [pair.fade for pair in stream.measurements([1001, 1002, 1003])[1]] == [1, 1]
+
+
+def test_a_cut_to_other_light_is_a_cut_and_no_fade(tmp_path):
+    def cut(index, layers):
+        if index >= 2:
+            layers["ViewLayer.Combined"][:] = 20 * layers["ViewLayer.Combined"][::-1, ::-1].copy()
+
+    scene, alone = Scene(frames=4, height=64, width=96, noise=0.2), {"Vector", "Denoising Albedo", "Denoising Normal"}
+    plan = plan_shot(open_shot(scene.write(tmp_path, edit=cut, without=alone)))
+    assert plan.cuts == ((1002, 1003),)
+    assert "fade" not in plan.stages
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_one_seed_is_found_in_a_fade(tmp_path, half):
+    """Fireflies of one seed would pass for lamps, and its noise for certain samples."""
+    scene = Scene(height=64, width=96, step=(0, 0))
+
+    def edit(index, layers):
+        color = scene.noisy(0)["ViewLayer.Combined"]
+        color[np.random.default_rng(3).random((64, 96)) < 0.003] += 60
+        color *= np.float32(0.8**index)
+        layers["ViewLayer.Combined"] = color.astype(np.float16 if half else np.float32).astype(np.float32)
+
+    stream = FrameStream(open_shot(scene.write(tmp_path, edit=edit)), Rules(), radius=1)
+    pairs = stream.measurements([1001, 1002, 1003])[1]
+    assert [pair.fade for pair in pairs] == pytest.approx([0.8, 0.8], rel=1e-3)
+    assert all(pair.repeated for pair in pairs)
+    assert stream.frame(1002).fireflies > 10
+
+
+def test_lamps_fade_with_the_picture_or_stay_as_they_are(tmp_path):
+    """Either way the neighbours show them."""
+    for fade in (0.5, 1):
+
+        def lamps(index, layers, fade=fade):
+            layers["ViewLayer.Combined"] *= np.float32(0.5**index)
+            layers["ViewLayer.Combined"][8::16, 8::16] = 40 * fade**index
+
+        scene = Scene(height=64, width=96, step=(0, 0), noise=0.1)
+        stream = FrameStream(open_shot(scene.write(tmp_path / str(fade), edit=lamps)), Rules(), radius=1)
+        for index, number in enumerate(stream.shot.numbers):
+            light = stream.frame(number).highlights.light
+            assert len(light) >= 12  # of 24: the texture hides some
+            np.testing.assert_allclose(light.mean(axis=-1), 40 * fade**index, rtol=0.05)
+
+
+def test_aovs_fade_by_factors_of_their_own(tmp_path):
+    """The key light fades, the fill light and a noisy mask stay as they are."""
+    scene = Scene(height=64, width=96, step=(0, 0))
+
+    def split(index, layers):
+        key = layers["ViewLayer.Combined"] * np.float32(0.5**index)
+        fill = grained(np.full_like(key, 0.1), (3, index))
+        mask = grained(layers["ViewLayer.Denoising Albedo"], (4, index))
+        lights = {"ViewLayer.Combined_key": key, "ViewLayer.Combined_fill": fill, "ViewLayer.emission": mask}
+        layers |= {"ViewLayer.Combined": key + fill, **lights}
+
+    window = FrameStream(open_shot(scene.write(tmp_path, edit=split), aovs=["all"]), Rules(), radius=1).window(1002)
+    assert "fade" in window.stages
+    for name, layer in window.centre.aovs.items():
+        means = [frame.aovs[name].mean() for frame in window.frames]
+        np.testing.assert_allclose(means, layer.mean(), rtol=0.1, err_msg=name)
