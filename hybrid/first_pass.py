@@ -16,6 +16,7 @@ import numpy as np
 
 from hybrid.alignment.align import align
 from hybrid.alignment.fireflies import REACH
+from hybrid.alignment.measure import FIXED_NOISE_ABOVE, fixed_noise
 from hybrid.files.frame import Array, Frame
 from hybrid.files.shots import Shot, open_matching_sequence, output_path
 from hybrid.files.sources import MADE_FROM, describe_sources, sources_in, versions, why_stale
@@ -28,7 +29,7 @@ from nlm.fireflies import Highlights, clamp_halos
 
 GUIDE_RADIUS = 1  # frames on each side that tell whether a frame's guides hold noise
 # Each frame is denoised in one of eight orientations, by its number: the errors of a network in an image and in the
-# image turned differ, and average out over a window.
+# image turned differ, and average out over a window. Noise that stands still is not averaged.
 ORIENTATIONS = 8
 
 # Quality of each mode of OIDN, and of the filters that its guides go through first.
@@ -56,7 +57,8 @@ class PerFrame(FirstPass):
     reads_frame = True
 
     def make(self, stream: FrameStream, number: int) -> Array | None:
-        frame, prepared = stream.as_read(number), stream.frame(number)
+        prepared = stream.frame(number)
+        frame = replace(stream.as_read(number), orientation=_orientation(stream, number))
         with stream.timings.stage("estimate"):
             return _checked(self.function(frame), frame, None if prepared is None else prepared.highlights)
 
@@ -76,7 +78,8 @@ class GuideAware(FirstPass):
         prepared = stream.frame(number)
         assert prepared is not None
         noisy = "prefilter" in stream.plan(stream.around(number, GUIDE_RADIUS)).stages
-        frame = Frame(number, prepared.radiance, prepared.albedo, prepared.normal)
+        orientation = _orientation(stream, number)
+        frame = Frame(number, prepared.radiance, prepared.albedo, prepared.normal, orientation=orientation)
         with stream.timings.stage("estimate"):
             return _checked(self.function(frame, noisy), frame)
 
@@ -278,9 +281,22 @@ def _run_mode(mode: str, frame: Frame, noisy_guides: bool = True, *, denoise: Ca
     return _denoise_turned(frame, denoise, **settings)
 
 
+def _orientation(stream: FrameStream, number: int) -> int:
+    """The orientation of a frame's number; 0 where its noise is that of a frame beside it, or frames cannot tell.
+
+    The errors of frames with equal noise would differ, and flicker.
+    """
+    here, step = stream.rendered(number), stream.shot.step
+    if here is None or "fireflies" not in stream.rules.allowed:  # neighbours are read for these
+        return 0
+    beside = [there for n in (number - step, number + step) if (there := stream.rendered(n)) is not None]
+    held = any(fixed_noise(here, there, moves=False) > FIXED_NOISE_ABOVE for there in beside)
+    return 0 if held else number % ORIENTATIONS
+
+
 def _denoise_turned(frame: Frame, denoise: Callable[..., Array], **mode: Any) -> Array:
-    """Run OIDN on a frame in the orientation of its number."""
-    mirrored, turns = divmod(frame.number % ORIENTATIONS, 4)
+    """Run OIDN on a frame in its orientation."""
+    mirrored, turns = divmod(frame.orientation, 4)
 
     def turn(image: Array) -> Array:
         return np.ascontiguousarray(np.rot90(image[:, ::-1] if mirrored else image, turns))

@@ -118,7 +118,7 @@ class FrameStream:
         if ("read", (number,)) not in self._cache:
             self._read(number)
         frame = cast(Frame, self._cache["read", (number,)])
-        return frame if prepared is self._rendered(number) else replace(frame, color=prepared.radiance)
+        return frame if prepared is self.rendered(number) else replace(frame, color=prepared.radiance)
 
     def denoised(self, number: int) -> Array | None:
         """The first pass of a frame, radiance (H, W, 3); None where there is none."""
@@ -240,15 +240,15 @@ class FrameStream:
 
     def _load(self, number: int) -> PreparedFrame:
         """Read and prepare a frame, and remove its fireflies."""
-        rendered = self._rendered(number)
+        rendered = self.rendered(number)
         assert rendered is not None
         if self.source is None or not self.source.reads_frame:
             self._cache.pop(("read", (number,)), None)
         if "fireflies" not in self.rules.allowed:
             return rendered
-        return remove_fireflies(rendered, lambda k: self._rendered(number + k * self.shot.step), self.timings)
+        return remove_fireflies(rendered, lambda k: self.rendered(number + k * self.shot.step), self.timings)
 
-    def _rendered(self, number: int) -> PreparedFrame | None:
+    def rendered(self, number: int) -> PreparedFrame | None:
         """A frame with its fireflies; None where the shot has none."""
         return self._cached("rendered", (number,), self._read) if self.shot.has(number) else None
 

@@ -37,6 +37,7 @@ class Frame:
     source: Path | None = None  # the file
     # (H, W, 3): where the color is +Inf because its light exceeds the range of half; the color is NaN there
     beyond: np.ndarray | None = None
+    orientation: int = 0  # in which a first pass denoises it: 0 to 3 quarter turns, 4 to 7 of the mirrored image
 
     def __post_init__(self) -> None:
         if self.color.ndim != 3 or self.color.shape[2] != 3:

@@ -157,7 +157,7 @@ def test_frames_with_their_fireflies_are_kept_for_the_next_alone(tmp_path, monke
         layers["ViewLayer.Combined"][20, 2 + 5 * index] = 5000
 
     read = []
-    monkeypatch.setattr(FrameStream, "_rendered", spied(FrameStream._rendered, read))
+    monkeypatch.setattr(FrameStream, "rendered", spied(FrameStream.rendered, read))
     shot = open_shot(CALM.write(tmp_path, edit=everywhere))
     reads = []
     monkeypatch.setattr(type(shot), "read", spied(type(shot).read, reads))
