@@ -26,7 +26,8 @@ _MIRRORED = 32
 _LEAST, _EDGE = 16, 0.9
 # Fewer connected pixels of +Inf are fireflies: one bright sample covers a pixel, with a renderer's filter up to 2×2.
 _LIGHT = 5
-# Side, pixels, of the least square without samples of anything: few samples leave single pixels of a volume black.
+# Side, pixels, of the least square without samples of anything: few samples leave single pixels of a volume black. One
+# in a hundred of them lit leaves such squares, but hardly one that is four times as wide.
 _EMPTY = 15
 
 
@@ -158,6 +159,10 @@ def _empty(frame: Frame) -> Mask | None:
     bare = np.logical_and.reduce([_is_zero(layer) for layer in guides]) if guides else np.False_
     missed = np.asarray(black & (transparent | bare), np.uint8)
     empty = cv2.morphologyEx(missed, cv2.MORPH_OPEN, np.ones((_EMPTY, _EMPTY), np.uint8)) > 0
+    _, labels, sizes, _ = cv2.connectedComponentsWithStats(1 - missed, connectivity=8)
+    single = (missed == 0) & (sizes[labels, cv2.CC_STAT_AREA] < _LIGHT)
+    if single.any():
+        empty &= cv2.dilate(single.astype(np.uint8), np.ones((4 * _EMPTY + 1, 4 * _EMPTY + 1), np.uint8)) == 0
     return empty if empty.any() else None
 
 

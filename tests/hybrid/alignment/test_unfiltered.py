@@ -267,13 +267,14 @@ def test_black_stays_black_where_nothing_is(tmp_path, told_by):
 
 def test_pixels_that_few_samples_leave_black_are_not_empty():
     rng = np.random.default_rng(4)
-    smoke = (rng.random((48, 64, 1)) < 0.1) * np.ones(3, np.float32)
-    smoke = smoke.astype(np.float32)
-    assert split_unfiltered(Frame(1, smoke, albedo=smoke, normal=smoke))[1].empty is None
-    smoke[:, 40:] = 0
-    empty = split_unfiltered(Frame(1, smoke, albedo=smoke, normal=smoke))[1].empty
-    assert empty[:, 41:].all()
-    assert not empty[:, :30].any()
-    surface = np.ones((48, 64, 3), np.float32)  # black because no light reaches it
+    for share in (0.1, 0.01):
+        smoke = (rng.random((48, 128, 1)) < share) * np.ones(3, np.float32)
+        smoke = smoke.astype(np.float32)
+        assert split_unfiltered(Frame(1, smoke, albedo=smoke, normal=smoke))[1].empty is None
+        smoke[:, 40:] = 0
+        empty = split_unfiltered(Frame(1, smoke, albedo=smoke, normal=smoke))[1].empty
+        assert empty[:, 71:].all()
+        assert not empty[:, :40].any()
+    surface = np.ones((48, 128, 3), np.float32)  # black because no light reaches it
     assert split_unfiltered(Frame(1, smoke, albedo=surface, normal=smoke))[1].empty is None
     assert split_unfiltered(Frame(1, smoke))[1].empty is None
