@@ -319,7 +319,8 @@ def _factor(first: Array, second: Array, known: Mask) -> float:
     lit = known & (np.minimum(first, second) > NO_LIGHT)
     if not lit.any():
         return 1.0
-    change = np.log(np.where(lit, second, 1)) - np.log(np.where(lit, first, 1))
+    # A quotient, which is the same to the bit for frames times a power of two.
+    change = np.log(np.divide(second, first, out=np.ones(first.shape), where=lit, dtype=np.float64))
     extent = tuple(slice(*np.flatnonzero(lit.any(axis=axis))[[0, -1]] + (0, 1)) for axis in (1, 0))
     change, lit = change[extent], lit[extent]
     strips = zip(np.array_split(change, 4), np.array_split(lit, 4), strict=True)

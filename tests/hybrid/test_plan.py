@@ -248,6 +248,14 @@ def test_light_of_pixels_without_vectors_is_no_fade(tmp_path):
     assert [pair.fade for pair in stream.measurements([1001, 1002, 1003])[1]] == [1, 1]
 
 
+def test_a_fade_is_the_same_at_any_scale(tmp_path):
+    fades = []
+    for scale in (1, 2.0**10, 2.0**-10):
+        shot = open_shot(Scene().write(tmp_path / str(scale), edit=faded(0.7), scale=scale))
+        fades.append([pair.fade for pair in FrameStream(shot, Rules()).measurements(shot.numbers)[1]])
+    assert fades[0] == fades[1] == fades[2] != [1, 1]
+
+
 def test_light_of_three_fifths_of_a_picture_is_no_fade(tmp_path):
     def blink(index, layers):
         layers["ViewLayer.Combined"][:, :58] *= np.float32(1.5 ** (index % 2))
