@@ -6,7 +6,17 @@ from itertools import product
 
 import numpy as np
 
-from hybrid.alignment.measure import MOVED_NOISE, NEAR, SAME, equal_noise, measure_fade, repeats, same_noise_at, scaled
+from hybrid.alignment.measure import (
+    MOVED_NOISE,
+    NEAR,
+    SAME,
+    equal_noise,
+    measure_fade,
+    noise_free_around,
+    repeats,
+    same_noise_at,
+    scaled,
+)
 from hybrid.alignment.prepare import PreparedFrame, rendered_flow
 from hybrid.runtime.timing import Timings
 from loops.parallel import Mask, Places
@@ -64,7 +74,8 @@ def _find_highlights(
     rough = measure_highlights(frame.irradiance, places)
     centre = measure_highlights(frame.irradiance, nearest_pixel(rough.points), frame.divisor_at)
     asked, shown = np.zeros(len(places), int), np.zeros(len(places), int)
-    alone = np.ones(len(places), bool)
+    free = noise_free_around(frame, places)
+    alone = ~free
     still = np.zeros_like(centre.points)
     moved, last = {-1: still, 1: still}, {-1: frame, 1: frame}
     found: list[tuple[Highlights, Points, Mask]] = []
@@ -95,6 +106,7 @@ def _find_highlights(
                 if unmoved.any():
                     noise = equal_noise(other.irradiance, there.irradiance, equal)
                     fresh = fresh & ~(unmoved & same_noise_at(*noise, pixels))
+            fresh |= free & np.isfinite(lights.light).all(axis=1)  # equal frames without noise are no sample twice
             if distance == 1:
                 alone &= ~(fresh & recurs_nearby(places, frame.irradiance, pixels, there.irradiance))
             same = fresh & undecided & same_highlight(centre, moved[side], lights)

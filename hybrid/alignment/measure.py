@@ -10,7 +10,7 @@ from flow.guide import tone_map
 from flow.tvl1 import rough_flow
 from flow.warp import warp
 from hybrid.alignment.prepare import PreparedFrame, rendered_flow, rough_light
-from hybrid.alignment.transfer import NO_LIGHT, compress, measure_exposure, remodulate
+from hybrid.alignment.transfer import ALBEDO_FLOOR, NO_LIGHT, compress, measure_exposure, remodulate
 from hybrid.files.frame import Array
 from loops.parallel import Mask, Places
 from nlm.average import channel_mean, reject_outliers
@@ -42,6 +42,12 @@ REPEATED = 0.99
 NOISE_AROUND, FEW = 33, 32
 # Rows that are compared at a time, until it is certain that a frame does not repeat another.
 NOISE_ROWS = 64
+# Pixels on each side in which `noise_free_around` looks for noise, the least number of lit ones, and the share of them
+# that lies on a line with its neighbours: of noise of 1 % a third does.
+AROUND, LIT, STRAIGHT = 16, 32, 0.9
+TOGETHER = 256  # places that are looked at together: the pixels around all at once would take gigabytes
+# Albedo below that of any surface, by which light is divided in place of black.
+BLACK = np.float32(1e-3)
 # A tile that differs from its smoothed version by less than this, relative to exposure, has no noise.
 NOISE_FREE = 1e-4
 TILE = 32
@@ -158,6 +164,8 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
     alike = smalls[0], smalls[1].relit(1 / fade)
     differ = changed if fade == 1 else _changed(alike[0].textured(), alike[1].textured(), None)
     lit, same = (there, SAME) if fade == 1 else (scaled(there, 1 / fade), NEAR)
+    equal = repeats(here.irradiance, lit.irradiance, same)
+    free = equal and _is_noise_free(here)
     cut = differ > CUT and _is_cut(here, there, alike, vectors)
     unexplained = changed if reduced is None else _changed(*smalls, reduced)
     return PairFacts(
@@ -166,10 +174,10 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
         speed=speed,
         changed=changed,
         unexplained=max(unexplained, _changed_areas(*smalls, reduced)),
-        fixed_noise=fixed_noise(here, lit, moves=changed > 0, same=same),
+        fixed_noise=0.0 if free else fixed_noise(here, lit, moves=changed > 0, same=same),
         guide_noise=_guide_noise(here, there, vectors, smalls[0].factor),
         cut=cut,
-        repeated=repeats(here.irradiance, lit.irradiance, same),
+        repeated=equal and not free,
         fade=1.0 if cut else fade,
     )
 
@@ -274,6 +282,38 @@ def repeats(here: Array, there: Array, same: float = SAME) -> bool:
         if grainy - equal > (1 - REPEATED) * size:  # too many already, whatever follows
             return False
     return bool(grainy >= FEW and equal >= REPEATED * grainy)
+
+
+def noise_free_around(frame: PreparedFrame, places: Places) -> Mask:
+    """Return whether there is no noise in the light around places (K, 2); False where hardly any pixel is lit.
+
+    A pixel's light, color over albedo, is then the mean of those on two sides of it, as far as halves tell. What shows
+    no noise is seen or lit directly, and has no fireflies.
+    """
+    lit, straight = np.zeros((2, len(places)), int)
+    near, (height, width) = np.arange(-AROUND, AROUND + 1), frame.valid.shape
+    for first in range(0, len(places), TOGETHER):
+        some = slice(first, first + TOGETHER)
+        y, x = (places[some, axis, None] + near for axis in (0, 1))
+        inside = ((y >= 0) & (y < height))[:, :, None] & ((x >= 0) & (x < width))[:, None]
+        rows, columns = np.clip(y, 0, height - 1)[:, :, None], np.clip(x, 0, width - 1)[:, None]
+        light, divisor = frame.irradiance[rows, columns], frame.divisor_at(rows, columns)
+        if divisor is not None:
+            light = light * divisor / np.maximum(divisor - np.float32(ALBEDO_FLOOR), BLACK)
+        level = np.where(inside, light.mean(axis=-1), np.float32(0))
+        centre = level[:, 1:-1, 1:-1]
+        sides = level[:, 1:-1, :-2] + level[:, 1:-1, 2:], level[:, :-2, 1:-1] + level[:, 2:, 1:-1]
+        off = np.minimum(*(np.abs(side / 2 - centre) for side in sides))
+        lit[some] = (centre > 0).sum(axis=(1, 2))
+        straight[some] = ((centre > 0) & (off <= 2 * NEAR * centre)).sum(axis=(1, 2))
+    return np.asarray((lit >= LIT) & (straight >= STRAIGHT * lit))
+
+
+def _is_noise_free(frame: PreparedFrame) -> bool:
+    """Whether there is no noise in most of a frame: if it equals its neighbour, none of its samples is there twice."""
+    height, width = frame.valid.shape
+    grid = np.mgrid[AROUND : height : 2 * AROUND, AROUND : width : 2 * AROUND].reshape(2, -1).T
+    return bool(len(grid)) and float(noise_free_around(frame, grid).mean()) > STRAIGHT
 
 
 def same_noise_at(grainy: Array, equal: Array, pixels: Places) -> Mask:

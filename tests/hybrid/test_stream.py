@@ -10,7 +10,7 @@ import pytest
 from hybrid.files.shots import open_shot
 from hybrid.plan import Context, Rules
 from hybrid.stream import FrameStream, plan_shot
-from tests.scenes import Scene
+from tests.scenes import Scene, grained
 
 # Locked off. Frame numbers 1001 to 1012.
 CALM = Scene(frames=12, step=(0, 0), height=48, width=64)
@@ -209,3 +209,24 @@ def test_a_part_that_changes_leaves_the_light_of_others_alone(tmp_path):
     assert all(
         there is stream.frame(n) for n, there in zip((1001, 1002, 1003), stream.window(1002).frames, strict=True)
     )
+
+
+@pytest.mark.parametrize("noise", [0, 0.1])
+def test_equal_frames_without_noise_are_no_frame_shown_twice(tmp_path, noise):
+    """A still shot without noise lost all of its small lamps: no other frame counted as their witness."""
+    places = [(12, 10), (12, 40), (30, 24), (38, 50)]
+    grain = grained(np.ones((48, 64, 3), np.float32), 5, noise) if noise else 1
+
+    def lamps(_, layers):
+        layers["ViewLayer.Combined"] = layers["ViewLayer.Combined"] * grain
+        for place in places:
+            layers["ViewLayer.Combined"][place] = 900
+
+    scene = Scene(frames=3, step=(0, 0), height=48, width=64)
+    stream = FrameStream(open_shot(scene.write(tmp_path, clean=True, edit=lamps)), Rules(), radius=1)
+    (pair, _), frame = stream.measurements([1001, 1002, 1003])[1], stream.frame(1002)
+    assert pair.repeated == (noise > 0)
+    assert (pair.fixed_noise > 0.5) == (noise > 0)
+    assert frame.fireflies == (len(places) if noise else 0)
+    if not noise:
+        assert sorted(map(tuple, frame.highlights.pixels)) == places
