@@ -14,7 +14,7 @@ Four = tuple[Any, Any, Any, Any]
 class Place(NamedTuple):
     """Whether a position is in the frame, its four pixels, and its fractions from the first pixel (x0, y0)."""
 
-    inside: np.bool
+    inside: np.bool_
     x0: int
     y0: int
     x1: int
