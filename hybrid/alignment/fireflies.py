@@ -74,8 +74,7 @@ def _find_highlights(
     rough = measure_highlights(frame.irradiance, places)
     centre = measure_highlights(frame.irradiance, nearest_pixel(rough.points), frame.divisor_at)
     asked, shown = np.zeros(len(places), int), np.zeros(len(places), int)
-    free = noise_free_around(frame, places)
-    alone = ~free
+    alone = np.ones(len(places), bool)
     still = np.zeros_like(centre.points)
     moved, last = {-1: still, 1: still}, {-1: frame, 1: frame}
     found: list[tuple[Highlights, Points, Mask]] = []
@@ -106,7 +105,11 @@ def _find_highlights(
                 if unmoved.any():
                     noise = equal_noise(other.irradiance, there.irradiance, equal)
                     fresh = fresh & ~(unmoved & same_noise_at(*noise, pixels))
-            fresh |= free & np.isfinite(lights.light).all(axis=1)  # equal frames without noise are no sample twice
+            equal_frames = ~fresh & np.isfinite(lights.light).all(axis=1)
+            if equal_frames.any():  # without noise they are no sample shown twice
+                free = np.zeros(len(places), bool)
+                free[equal_frames] = noise_free_around(frame, places[equal_frames])
+                fresh = fresh | free
             if distance == 1:
                 alone &= ~(fresh & recurs_nearby(places, frame.irradiance, pixels, there.irradiance))
             same = fresh & undecided & same_highlight(centre, moved[side], lights)
