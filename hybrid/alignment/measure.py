@@ -244,10 +244,11 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool, same:
     compared = still & grainy
     if compared.any():
         distance, greater = np.abs(a - b)[compared], np.maximum(np.abs(a), np.abs(b))[compared]
-        equal, near = (np.count_nonzero(distance <= share * greater) for share in (same, NEAR * same / SAME))
+        equal, near = (np.count_nonzero(distance <= share * greater) for share in (same, max(NEAR, 2 * same)))
         shares.append(distance.size)
-        # Noise of a thousandth makes as many halves equal by chance as half of those one step apart.
-        figures.append((equal - (near - equal) / 2) / distance.size)
+        # Noise of a thousandth makes as many halves equal by chance as half of those one step apart; in a fade, where
+        # no step tells, as many as those up to twice as far.
+        figures.append((equal - (near - equal) / (2 if same == SAME else 1)) / distance.size)
     if moved.sum() > CROP and forth is not None and back is not None:
         d_a = a - channel_mean(_warp_block(there.irradiance, forth[0], block))
         d_b = b - channel_mean(_warp_block(here.irradiance, back[0], block))
