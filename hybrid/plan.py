@@ -21,7 +21,7 @@ STAGES = {
     "warp": "warp neighbouring frames along the motion",
     "dense-flow": "estimate the motion from the pictures by TV-L1",
     "refine": "correct the renderer's vectors by TV-L1",
-    "fade": "scale neighbouring frames to the light of the centre where one factor explains the change",
+    "fade": "scale neighbouring frames to the light of the centre where a factor of each channel explains the change",
     "gate": "do not average over time where the light itself changes",
     "drift": "average less of denoised frames whose light drifts, as far as samples show",
     "fixed-noise": "do not average noise that stands still on the screen",
@@ -153,7 +153,7 @@ def measure_stages(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> 
     unexplained = max((pair.unexplained for pair in pairs), default=0.0)
     speed = max((pair.speed for pair in pairs), default=0.0)
     moves = speed > STILL if vectors else changed > GATE_ABOVE
-    fade = max((abs(float(np.log2(pair.fade))) for pair in pairs), default=0.0)
+    fade = max((float(np.abs(np.log2(pair.fade)).max()) for pair in pairs), default=0.0)
     fades = "the light of the whole picture changes by {:.2g} stops between frames" if fade else "no fade was found"
     changes = "{:.2%} of the picture changes its light between frames" + ("" if vectors else " (motion included)")
     outliers = "{:.2g} of the pixels stand alone far above their neighbours"

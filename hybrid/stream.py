@@ -16,9 +16,12 @@ from hybrid.alignment.align import align, expect_equal_layers
 from hybrid.alignment.fireflies import REACH, remove_fireflies
 from hybrid.alignment.flows import Flow, Link, PairFlows, compose_flows, measure_flows
 from hybrid.alignment.measure import (
+    NO_FADE,
+    Fade,
     FrameFacts,
     PairFacts,
     SmallFrame,
+    inverse,
     measure_frame,
     measure_pair,
     relit,
@@ -164,7 +167,7 @@ class FrameStream:
         window = self._collect(number, numbers, frames, denoised if with_first_pass else None)
         if not with_first_pass:
             return window
-        found = [(self._limited(n), np.float32(self._fade(n, number, window.stages))) for n in numbers]
+        found = [(self._limited(n), np.mean(self._fade(n, number, window.stages), dtype=np.float32)) for n in numbers]
         limited = (part and part._replace(exposure=part.exposure * fade) for part, fade in found)
         return replace(window, limited=tuple(limited))
 
@@ -211,11 +214,11 @@ class FrameStream:
         fades = [self._fade(n, number, plan.stages) for n in numbers]
         centre = self._there(number)
         frames = tuple(
-            frame if frame is None or fade == 1 else self.keeper.keep(relit(frame, fade, centre))
+            frame if frame is None or fade == NO_FADE else self.keeper.keep(relit(frame, fade, centre))
             for frame, fade in zip(frames, fades, strict=True)
         )
         denoised = denoised and tuple(
-            picture if picture is None or fade == 1 else self.keeper.keep(picture * np.float32(fade))
+            picture if picture is None or fade == NO_FADE else self.keeper.keep(picture * np.array(fade, np.float32))
             for picture, fade in zip(denoised, fades, strict=True)
         )
         return Window(frames, links, denoised, plan.stages, repeated, tuple(refined))
@@ -308,14 +311,15 @@ class FrameStream:
         first, second = sorted((a, b))
         return self.shot.has(first) and self.shot.has(second) and self._pair_facts(first, second).repeated
 
-    def _fade(self, number: int, centre: int, stages: Collection[str]) -> float:
-        """Factor of light from a frame of a window to its centre, with the stage "fade"; else 1."""
+    def _fade(self, number: int, centre: int, stages: Collection[str]) -> Fade:
+        """Factors of light from a frame of a window to its centre, with the stage "fade"; else 1."""
         if "fade" not in stages:
-            return 1.0
+            return NO_FADE
         first, last = sorted((number, centre))
-        fade = math.prod(pair.fade for pair in self.measurements(range(first, last + 1, self.shot.step))[1])
-        fade = fade if number < centre else 1 / fade
-        return fade if FAINT < fade < 1 / FAINT else 1.0
+        pairs = self.measurements(range(first, last + 1, self.shot.step))[1]
+        red, green, blue = (math.prod(pair.fade[c] for pair in pairs) for c in range(3))
+        fade = (red, green, blue) if number < centre else inverse((red, green, blue))
+        return fade if min(fade) > FAINT and max(fade) < 1 / FAINT else NO_FADE
 
     def _measure_flows(self, earlier: int, later: int) -> PairFlows:
         plan, facts = self.plan([earlier, later]), self._pair_facts(earlier, later)
@@ -324,7 +328,7 @@ class FrameStream:
         stages = plan.stages - {"warp"} if facts.repeated else plan.stages
         here, fade = self._there(earlier), self._fade(later, earlier, stages)
         there = self._there(later)
-        there = there if fade == 1 else scaled(there, fade)
+        there = there if fade == NO_FADE else scaled(there, fade)
         with self.timings.stage("flow"):
             return measure_flows(here, there, stages, self._refine)
 

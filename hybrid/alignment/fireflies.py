@@ -91,7 +91,7 @@ def _find_highlights(
             moved[side] = moved[side] + _motion(last[side], there, nearest_pixel(centre.points + moved[side]))
             last[side] = there
             fade = measure_fade(there.irradiance, frame.irradiance, frame.valid & there.valid)
-            if fade != 1:
+            if (fade != 1).any():
                 there, equal = scaled(there, fade), NEAR
             pixels = follow_motion(centre, moved[side])
             lights = measure_highlights(there.irradiance, pixels, there.divisor_at)

@@ -1,5 +1,6 @@
 """Measurements of frames and pairs, from which stages are chosen alike in every part of a shot (`hybrid.plan`)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -12,7 +13,7 @@ from flow.warp import warp
 from hybrid.alignment.prepare import PreparedFrame, rendered_flow, rough_light
 from hybrid.alignment.transfer import ALBEDO_FLOOR, NO_LIGHT, compress, measure_exposure, remodulate
 from hybrid.files.frame import Array
-from loops.parallel import Mask, Places
+from loops.parallel import Doubles, Mask, Places
 from nlm.average import channel_mean, reject_outliers
 from nlm.gate import color_gate
 
@@ -68,6 +69,10 @@ KNOWN = 6.0
 FIREFLY, EXPLAINED = 6.0, 2.0
 
 
+Fade = tuple[float, float, float]
+NO_FADE: Fade = (1.0, 1.0, 1.0)
+
+
 @dataclass(frozen=True)
 class FrameFacts:
     """Measurements of one frame."""
@@ -96,8 +101,8 @@ class PairFacts:
     guide_noise: float  # upper quartile of the difference of albedo and normal between the frames, along the vectors
     cut: bool = False  # whether the frames are of different scenes, so that they must not be averaged
     repeated: bool = False  # whether the later frame repeats the earlier one, and has no samples of its own
-    # factor of light from the earlier frame to the later, where one explains most of the change; else 1
-    fade: float = 1.0
+    # factor of each channel from the earlier frame to the later, where they explain most of the change; else 1
+    fade: Fade = NO_FADE
 
 
 @dataclass(frozen=True)
@@ -118,10 +123,10 @@ class SmallFrame:
         irradiance, light = (remodulate(layer, self.albedo) for layer in (self.irradiance, self.light))
         return replace(self, irradiance=irradiance, light=light, albedo=None)
 
-    def relit(self, fade: float) -> Self:
+    def relit(self, fade: Fade) -> Self:
         """Return the frame with `fade` times its light."""
-        irradiance, light = (layer * np.float32(fade) for layer in (self.irradiance, self.light))
-        return self if fade == 1 else replace(self, irradiance=irradiance, light=light)
+        irradiance, light = (layer * np.array(fade, np.float32) for layer in (self.irradiance, self.light))
+        return self if fade == NO_FADE else replace(self, irradiance=irradiance, light=light)
 
 
 # `cv2.remap`, faster than `flow.warp`, refuses images of more pixels on a side.
@@ -169,9 +174,9 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
         speed = float(np.quantile(np.hypot(flow[..., 0], flow[..., 1]), 0.999))
     reduced = None if vectors is None else _reduced(vectors, smalls[0])
     fade = _fade(*smalls, reduced)
-    alike = smalls[0], smalls[1].relit(1 / fade)
-    differ = changed if fade == 1 else _changed(alike[0].textured(), alike[1].textured(), None)
-    lit, same = (there, SAME) if fade == 1 else (scaled(there, 1 / fade), NEAR)
+    alike = smalls[0], smalls[1].relit(inverse(fade))
+    differ = changed if fade == NO_FADE else _changed(alike[0].textured(), alike[1].textured(), None)
+    lit, same = (there, SAME) if fade == NO_FADE else (scaled(there, inverse(fade)), NEAR)
     equal = repeats(here.irradiance, lit.irradiance, same)
     free = equal and _is_noise_free(here)
     cut = differ > CUT and _is_cut(here, there, alike, vectors)
@@ -186,7 +191,7 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
         guide_noise=_guide_noise(here, there, vectors, smalls[0].factor),
         cut=cut,
         repeated=equal and not free,
-        fade=1.0 if cut else fade,
+        fade=NO_FADE if cut else fade,
     )
 
 
@@ -349,64 +354,91 @@ def _changed(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | 
     return float(np.mean(weight[inside] < np.exp(-4))) if inside.any() else 0.0
 
 
-def _fade(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | None) -> float:
-    """Factor of light from the first of two frames to the second, along `vectors`; 1 where none explains the change."""
+def inverse(fade: Fade) -> Fade:
+    """Return the factors of the opposite direction."""
+    red, green, blue = (1 / factor for factor in fade)
+    return red, green, blue
+
+
+def _fade(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | None) -> Fade:
+    """Factors of light from the first of two frames to the second, along `vectors`; 1 where none explain the change."""
     other, known = there.light, here.valid & there.valid
     if vectors is not None:
         other, inside = warp(there.light, vectors[0])
         known = here.valid & inside & vectors[1]
-    light = channel_mean(here.light)
-    noise = (channel_mean(here.irradiance) - light) / np.maximum(light, np.float32(NO_LIGHT))
-    return _factor(light, channel_mean(other), known, noise)
+    red, green, blue = _factors(here.light, other, known, here.irradiance - here.light)
+    return float(red), float(green), float(blue)
 
 
-def _factor(first: Array, second: Array, known: Mask, noise: Array | None = None) -> float:
-    """Median of the second of two images (H, W) over the first, where `known`; 1 where that explains little.
+def _factors(first: Array, second: Array, known: Mask, noise: Array | None = None) -> Doubles:
+    """Median (C,) of the second of two images (H, W, C) over the first, where `known`; 1 where that explains little.
 
     Changes are medians of logarithms in 4×6 areas of the lit part, which average noise. A factor that leaves less than
     half of them, or a quarter of slight ones, in three quarters of the areas is one of the whole picture: on rendered
     shots of 8 to 512 samples 0.59 to 1.2 are left where light moves, and of fades by 0.7 less than half in 73 of 80. So
-    is a factor beyond its error, where `noise` (H, W), relative to the first image, explains what it leaves.
+    is a factor beyond its error, where the `noise` (H, W, C) of the first image explains what it leaves. One factor
+    serves for all channels unless those of three channels leave less than half.
     """
-    lit = known & (np.minimum(first, second) > NO_LIGHT)
+    mean = channel_mean(first)
+    lit = known & (np.minimum(mean, channel_mean(second)) > NO_LIGHT)
     if not lit.any():
-        return 1.0
-    # A quotient, which is the same to the bit for frames times a power of two.
-    change = np.log(np.divide(second, first, out=np.ones(first.shape), where=lit, dtype=np.float64))
+        return np.ones(first.shape[2])
     rows, columns = (np.arange(*np.flatnonzero(lit.any(axis=axis))[[0, -1]] + (0, 1)) for axis in (1, 0))
     cells = [np.ix_(y, x) for y in np.array_split(rows, 4) for x in np.array_split(columns, 6)]
     cells = [cell for cell in cells if lit[cell].any()]
-    areas = np.array([np.median(change[cell][lit[cell]]) for cell in cells])
-    factor = np.median(areas)
-    most = 0.25 if abs(factor) < SLIGHT else 0.5
-    left, change = (np.quantile(np.abs(areas - middle), 0.75) for middle in (factor, 0))
-    explains = left < most * change
-    if not explains and noise is not None and abs(factor) > max(LEAST_FADE, KNOWN * left / np.sqrt(len(areas))):
-        squares = np.square(np.minimum(np.abs(noise), np.float32(FIREFLY)))
+    gray = _changes(mean, channel_mean(second), lit, cells)
+    areas, factors = gray[:, None], np.array([np.median(gray)])
+    if first.shape[2] == 3 and len(cells) >= LEAST_AREAS:
+        tinted = np.stack([_changes(first[..., c], second[..., c], lit, cells, gray) for c in range(3)], axis=1)
+        if 2 * _upper_quartile(tinted - np.median(tinted, axis=0)) < _upper_quartile(tinted - factors):
+            areas, factors = tinted, np.median(tinted, axis=0)
+    left, change = _upper_quartile(areas - factors), _upper_quartile(areas)
+    size = float(np.abs(factors).max())
+    explains = left < (0.25 if size < SLIGHT else 0.5) * change
+    if not explains and noise is not None and size > max(LEAST_FADE, KNOWN * left / np.sqrt(len(areas))):
+        noise, light = (noise, first) if len(factors) == 3 else (channel_mean(noise)[..., None], mean[..., None])
+        relative = np.abs(noise) / np.maximum(light, np.float32(NO_LIGHT))
+        squares = np.square(np.minimum(relative, np.float32(FIREFLY))).mean(axis=2)
         errors = [np.sqrt(2 * np.mean(squares[cell][lit[cell]]) / np.count_nonzero(lit[cell])) for cell in cells]
         explains = left < EXPLAINED * np.median(errors)
-    return float(np.exp(factor)) if len(areas) >= LEAST_AREAS and explains else 1.0
+    found = len(areas) >= LEAST_AREAS and explains
+    return np.broadcast_to(np.exp(factors) if found else np.ones(1), first.shape[2])
 
 
-def measure_fade(frame: Array, centre: Array, valid: Mask) -> float:
-    """Factor of light from one layer (H, W, C) to another, at equal pixels; 1 where none explains the change."""
+def _changes(
+    first: Array, second: Array, lit: Mask, cells: Sequence[tuple[Places, ...]], otherwise: Doubles | None = None
+) -> Doubles:
+    """Median in each cell of the logarithm of the second of two images (H, W) over the first, where both are lit."""
+    # A quotient, which is the same to the bit for frames times a power of two.
+    known = lit & (np.minimum(first, second) > NO_LIGHT)
+    change = np.log(np.divide(second, first, out=np.ones(first.shape), where=known, dtype=np.float64))
+    changes = [np.median(change[cell][known[cell]]) if known[cell].any() else np.nan for cell in cells]
+    return np.array(changes) if otherwise is None else np.where(np.isnan(changes), otherwise, changes)
+
+
+def _upper_quartile(changes: Doubles) -> float:
+    """Upper quartile over areas of the root mean square over channels of changes (N, C)."""
+    return float(np.quantile(np.sqrt(np.mean(np.square(changes), axis=1)), 0.75))
+
+
+def measure_fade(frame: Array, centre: Array, valid: Mask) -> Array:
+    """Factors (C,) of light from one layer (H, W, C) to another, at equal pixels; 1 where none explain the change."""
     step = max(min(valid.shape) // SHORT_SIDE, 1)
-    first, second = (channel_mean(np.ascontiguousarray(layer[::step, ::step])) for layer in (frame, centre))
-    return _factor(first, second, valid[::step, ::step])
+    first, second = (np.ascontiguousarray(layer[::step, ::step]) for layer in (frame, centre))
+    return _factors(first, second, valid[::step, ::step]).astype(np.float32)
 
 
-def scaled(frame: PreparedFrame, fade: float) -> PreparedFrame:
+def scaled(frame: PreparedFrame, fade: Fade | Array) -> PreparedFrame:
     """Return a frame with `fade` times its light, but for its AOVs."""
-    factor = np.float32(fade)
+    factor = np.array(fade, np.float32)
     variance = None if frame.variance is None else np.asarray(frame.variance * factor * factor)
     return replace(frame, irradiance=np.asarray(frame.irradiance * factor), variance=variance)
 
 
-def relit(frame: PreparedFrame, fade: float, centre: PreparedFrame) -> PreparedFrame:
+def relit(frame: PreparedFrame, fade: Fade, centre: PreparedFrame) -> PreparedFrame:
     """Return a frame with `fade` times its light, as a neighbour of the centre; AOVs by the factors of their own."""
     valid = frame.valid & centre.valid
-    fades = {name: measure_fade(layer, centre.aovs[name], valid) for name, layer in frame.aovs.items()}
-    aovs = {name: layer * np.float32(fades[name]) for name, layer in frame.aovs.items()}
+    aovs = {name: layer * measure_fade(layer, centre.aovs[name], valid) for name, layer in frame.aovs.items()}
     return replace(scaled(frame, fade), aovs=aovs)
 
 

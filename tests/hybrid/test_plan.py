@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from hybrid.files.shots import open_shot
+from hybrid.alignment.measure import NO_FADE
 from hybrid.plan import DENOISED, NOISY, STAGES, Context, Rules, merge
 from hybrid.stream import FrameStream, plan_shot
 from tests.scenes import Scene, grained, only
@@ -236,7 +237,7 @@ def test_a_fade_of_a_small_thing_without_vectors_around_it_is_found(tmp_path):
 
     scene = Scene(height=64, width=96, noise=0.1)
     stream = FrameStream(open_shot(scene.write(tmp_path, edit=small)), Rules(), radius=1)
-    assert [pair.fade for pair in stream.measurements([1001, 1002, 1003])[1]] == pytest.approx([0.5, 0.5], rel=0.05)
+    assert [pair.fade[1] for pair in stream.measurements([1001, 1002, 1003])[1]] == pytest.approx([0.5, 0.5], rel=0.05)
 
 
 def test_light_of_pixels_without_vectors_is_no_fade(tmp_path):
@@ -245,7 +246,7 @@ def test_light_of_pixels_without_vectors_is_no_fade(tmp_path):
         layers["ViewLayer.Vector"][:, :64] = np.nan
 
     stream = FrameStream(open_shot(Scene(height=64, width=96).write(tmp_path, edit=blink)), Rules(), radius=1)
-    assert [pair.fade for pair in stream.measurements([1001, 1002, 1003])[1]] == [1, 1]
+    assert [pair.fade for pair in stream.measurements([1001, 1002, 1003])[1]] == [NO_FADE, NO_FADE]
 
 
 def test_a_fade_is_the_same_at_any_scale(tmp_path):
@@ -253,7 +254,7 @@ def test_a_fade_is_the_same_at_any_scale(tmp_path):
     for scale in (1, 2.0**10, 2.0**-10):
         shot = open_shot(Scene().write(tmp_path / str(scale), edit=faded(0.7), scale=scale))
         fades.append([pair.fade for pair in FrameStream(shot, Rules()).measurements(shot.numbers)[1]])
-    assert fades[0] == fades[1] == fades[2] != [1, 1]
+    assert fades[0] == fades[1] == fades[2] != [NO_FADE, NO_FADE]
 
 
 def test_light_of_three_fifths_of_a_picture_is_no_fade(tmp_path):
@@ -261,7 +262,35 @@ def test_light_of_three_fifths_of_a_picture_is_no_fade(tmp_path):
         layers["ViewLayer.Combined"][:, :58] *= np.float32(1.5 ** (index % 2))
 
     stream = FrameStream(open_shot(Scene(height=64, width=96, step=(0, 0)).write(tmp_path, edit=blink)), Rules())
-    assert [pair.fade for pair in stream.measurements([1001, 1002, 1003])[1]] == [1, 1]
+    assert [pair.fade for pair in stream.measurements([1001, 1002, 1003])[1]] == [NO_FADE, NO_FADE]
+
+
+@pytest.mark.parametrize("factors", [(0.94, 0.94, 0.94), (1, 1, 1), (1.2, 1, 0.8)])
+def test_factors_that_noise_hides_in_single_areas_are_found(tmp_path, factors):
+    """Light that alternates by 6 % came out at half of that, and one factor served for all channels."""
+
+    def alternate(index, layers):
+        layers["ViewLayer.Combined"] *= np.float32(factors) ** np.float32(index % 2)
+
+    scene = Scene(height=64, width=96, frames=4, noise=0.2)
+    stream = FrameStream(open_shot(scene.write(tmp_path, edit=alternate)), Rules(), radius=1)
+    found = [pair.fade for pair in stream.measurements([1001, 1002, 1003, 1004])[1]]
+    if factors == (1, 1, 1):
+        assert found == 3 * [NO_FADE]
+    else:
+        np.testing.assert_allclose(found, np.float64(factors) ** [[1], [-1], [1]], rtol=0.02)
+
+
+def test_light_that_changes_in_places_is_no_fade_in_any_noise(tmp_path):
+    """Half of the areas change by 6 %: what a factor leaves in the others is more than noise."""
+
+    def half(index, layers):
+        layers["ViewLayer.Combined"][:, :48] *= np.float32(1.06 ** (index % 2))
+
+    for noise in (0.01, 0.05):
+        scene = Scene(height=64, width=96, noise=noise, step=(0, 0))
+        stream = FrameStream(open_shot(scene.write(tmp_path / str(noise), edit=half)), Rules(), radius=1)
+        assert [pair.fade for pair in stream.measurements([1001, 1002, 1003])[1]] == [NO_FADE, NO_FADE]
 
 
 def test_a_cut_to_other_light_is_a_cut_and_no_fade(tmp_path):
@@ -288,7 +317,7 @@ def test_one_seed_is_found_in_a_fade(tmp_path, half):
 
     stream = FrameStream(open_shot(scene.write(tmp_path, edit=edit)), Rules(), radius=1)
     pairs = stream.measurements([1001, 1002, 1003])[1]
-    assert [pair.fade for pair in pairs] == pytest.approx([0.8, 0.8], rel=1e-3)
+    assert [pair.fade[1] for pair in pairs] == pytest.approx([0.8, 0.8], rel=1e-3)
     assert all(pair.repeated for pair in pairs)
     assert stream.frame(1002).fireflies > 10
 

@@ -160,7 +160,6 @@ OPEN = {
     "snow",
     "rain",
     "emitters of black albedo",
-    "channels fade",
     "a screen in a fade",
     "half the picture fades",
     "vectors NaN over nothing",
