@@ -154,16 +154,13 @@ CASES: dict[str, tuple[Scene, Edit]] = {
 
 # Worse than their input by 4 to 19 dB where the noise is 1 %: lights of a pixel that one frame shows, which pass for
 # fireflies where fewer than four neighbours tell, and lines of a pixel that cross the motion, so that vectors are not
-# trusted. By 1.5 to 9 dB: fades that one factor does not explain, in parts of the picture or by other factors in each
-# channel, where neighbours are not scaled. By 1.03 in one frame of `fast`: rims beside which vectors are no numbers.
+# trusted. By 1.5 to 9 dB: fades of parts of the picture, which are not scaled alike.
 OPEN = {
     "snow",
     "rain",
     "emitters of black albedo",
     "a screen in a fade",
     "half the picture fades",
-    "vectors NaN over nothing",
-    "vectors of 1e10 over nothing",
 }
 
 
