@@ -16,7 +16,7 @@ import numpy as np
 
 from hybrid.alignment.align import align
 from hybrid.alignment.fireflies import REACH
-from hybrid.alignment.measure import FIXED_NOISE_ABOVE, fixed_noise
+from hybrid.alignment.measure import FIXED_NOISE_ABOVE
 from hybrid.files.frame import Array, Frame
 from hybrid.files.shots import Shot, open_matching_sequence, output_path
 from hybrid.files.sources import MADE_FROM, describe_sources, sources_in, versions, why_stale
@@ -54,11 +54,13 @@ class PerFrame(FirstPass):
 
     # from a frame to its denoised radiance (H, W, 3), or None where it has none
     function: Callable[[Frame], Array | None]
+    turns: bool = False  # whether the function denoises a frame in its orientation
     reads_frame = True
 
     def make(self, stream: FrameStream, number: int) -> Array | None:
         prepared = stream.frame(number)
-        frame = replace(stream.as_read(number), orientation=_orientation(stream, number))
+        frame = stream.as_read(number)
+        frame = replace(frame, orientation=_orientation(stream, number)) if self.turns else frame
         with stream.timings.stage("estimate"):
             return _checked(self.function(frame), frame, None if prepared is None else prepared.highlights)
 
@@ -183,7 +185,7 @@ def named_first_pass(
             raise ImportError("first pass bundled: torch is needed, which this command does without; expected another")
         run = partial(_denoise_turned, denoise=backends.bundled, quality=OIDN_MODES[mode]["quality"])
         reason = "asked for" if spec == "bundled" else f"{why_no_oidn()}; a network comes with ravg"
-        return FirstPassSource("bundled", PerFrame(run), reason)
+        return FirstPassSource("bundled", PerFrame(run, turns=True), reason)
     reason = "asked for" if spec == "nlm" else f"no denoised picture in the file, and {why_no_oidn()}"
     return FirstPassSource("nlm", Classical(classical), reason)
 
@@ -222,7 +224,7 @@ def _oidn(mode: str, denoise: Callable[..., Array], in_torch: bool, store: "_Kep
         run = partial(store.read_or_run, run=run)
     # Networks in torch work on a strip at a time.
     holds = 0 if in_torch else HOLDS_FAST if mode == "oidn-fast" else HOLDS
-    first_pass = (GuideAware if mode == "oidn-clean" else PerFrame)(run, holds=holds)
+    first_pass = GuideAware(run, holds=holds) if mode == "oidn-clean" else PerFrame(run, turns=True, holds=holds)
     return FirstPassSource(mode, first_pass, "", kept=() if store is None else tuple(store.places.values()))
 
 
@@ -286,11 +288,10 @@ def _orientation(stream: FrameStream, number: int) -> int:
 
     The errors of frames with equal noise would differ, and flicker.
     """
-    here, step = stream.rendered(number), stream.shot.step
-    if here is None or "fireflies" not in stream.rules.allowed:  # neighbours are read for these
+    if "fireflies" not in stream.rules.allowed:  # neighbours are read for these
         return 0
-    beside = [there for n in (number - step, number + step) if (there := stream.rendered(n)) is not None]
-    held = any(fixed_noise(here, there, moves=False) > FIXED_NOISE_ABOVE for there in beside)
+    beside = [n for n in stream.around(number, 1) if n != number and stream.shot.has(n)]
+    held = any(stream.same_noise(*sorted((number, n))) > FIXED_NOISE_ABOVE for n in beside)
     return 0 if held else number % ORIENTATIONS
 
 

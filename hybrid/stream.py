@@ -21,6 +21,7 @@ from hybrid.alignment.measure import (
     FrameFacts,
     PairFacts,
     SmallFrame,
+    fixed_noise,
     inverse,
     measure_frame,
     measure_pair,
@@ -96,7 +97,7 @@ class FrameStream:
         self._cache = {
             (kind, frames): value
             for (kind, frames), value in self._cache.items()
-            if (first <= frames[0] <= last if kind in ("read", "rendered") else kept.issuperset(frames))
+            if (first <= frames[0] <= last if kind in ("read", "rendered", "same noise") else kept.issuperset(frames))
         }
 
     def around(self, number: int, radius: int | None = None) -> list[int]:
@@ -254,6 +255,13 @@ class FrameStream:
     def rendered(self, number: int) -> PreparedFrame | None:
         """A frame with its fireflies; None where the shot has none."""
         return self._cached("rendered", (number,), self._read) if self.shot.has(number) else None
+
+    def same_noise(self, a: int, b: int) -> float:
+        """The share of the noise of two neighbouring frames, ascending, that is the same at equal pixels."""
+        first, second = self.rendered(a), self.rendered(b)
+        assert first is not None
+        assert second is not None
+        return self._cached("same noise", (a, b), lambda *_: fixed_noise(first, second, moves=False))
 
     def _read(self, number: int) -> PreparedFrame:
         with self.timings.stage("read"):

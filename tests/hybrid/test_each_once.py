@@ -26,6 +26,7 @@ EXPECTED = {
     "measure_frame": FRAMES,
     "measure_pair": FRAMES - 1,
     "measure_flows": FRAMES - 1,
+    "fixed_noise": FRAMES - 1,  # for the orientations
     "first pass": FRAMES,
     "compose_flow": 2 * SECOND,
     "align": FRAMES,
@@ -55,7 +56,15 @@ def count(monkeypatch):
     def watch(owner, name):
         monkeypatch.setattr(owner, name, counted(name, getattr(owner, name)))
 
-    for name in ("prepare", "remove_fireflies", "shrink", "measure_frame", "measure_pair", "measure_flows"):
+    for name in (
+        "prepare",
+        "remove_fireflies",
+        "shrink",
+        "measure_frame",
+        "measure_pair",
+        "measure_flows",
+        "fixed_noise",
+    ):
         watch(stream, name)
     for name in ("align", "align_results", "find_bright", "restore_mean", "blend_samples"):
         watch(stabilize, name)
@@ -70,7 +79,7 @@ def count(monkeypatch):
 def test_each_stage_runs_once(tmp_path, count):
     counts, counted = count
     shot = open_shot(Scene(frames=FRAMES, noise=0.1).write(tmp_path / "in"))
-    first_pass = PerFrame(counted("first pass", lambda frame: frame.color.copy()))
+    first_pass = PerFrame(counted("first pass", lambda frame: frame.color.copy()), turns=True)
     denoise = counted("denoise", lambda aligned: Denoised(aligned.first_pass[RADIUS] * aligned.modulation))
     for _ in denoise_view(shot, tmp_path / "out", denoise, Rules(), first_pass, radius=RADIUS):
         pass

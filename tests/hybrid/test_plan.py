@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid.files.shots import open_shot
 from hybrid.alignment.measure import NO_FADE
+from hybrid.files.shots import open_shot
 from hybrid.plan import DENOISED, NOISY, STAGES, Context, Rules, merge
 from hybrid.stream import FrameStream, plan_shot
 from tests.scenes import Scene, grained, only
