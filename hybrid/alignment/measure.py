@@ -388,7 +388,7 @@ def _factors(first: Array, second: Array, known: Mask, noise: Array | None = Non
     cells = [cell for cell in cells if lit[cell].any()]
     gray = _changes(mean, channel_mean(second), lit, cells)
     areas, factors = gray[:, None], np.array([np.median(gray)])
-    if first.shape[2] == 3 and len(cells) >= LEAST_AREAS:
+    if first.shape[2] == 3 and _is_tinted(first, second, lit):
         tinted = np.stack([_changes(first[..., c], second[..., c], lit, cells, gray) for c in range(3)], axis=1)
         if 2 * _upper_quartile(tinted - np.median(tinted, axis=0)) < _upper_quartile(tinted - factors):
             areas, factors = tinted, np.median(tinted, axis=0)
@@ -403,6 +403,14 @@ def _factors(first: Array, second: Array, known: Mask, noise: Array | None = Non
         explains = left < EXPLAINED * np.median(errors)
     found = len(areas) >= LEAST_AREAS and explains
     return np.broadcast_to(np.exp(factors) if found else np.ones(1), first.shape[2])
+
+
+def _is_tinted(first: Array, second: Array, lit: Mask) -> bool:
+    """Whether the channels of a sixteenth of the pixels change by other factors."""
+    some = np.s_[::4, ::4]
+    before, after = first[some], second[some]
+    known = lit[some] & (np.minimum(before, after).min(axis=2) > NO_LIGHT)
+    return not known.any() or float(np.ptp(np.log(np.median(after[known] / before[known], axis=0)))) > LEAST_FADE / 2
 
 
 def _changes(
