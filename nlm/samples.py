@@ -74,6 +74,10 @@ _SECOND, _FEW = 0.33, 0.28
 # changes by 2 % a frame passes for 3 % of noise at a rim that one neighbour shows.
 _LIGHT = 1.25
 _LEFT = np.float32(1 - 1 / (4 * np.pi * _LIGHT**2))
+# Greatest factor between the light of neighbours and the centre's: where half of a picture fades by 0.6 a frame it is
+# 2.1, and with 2 the first frame lost 1.6 dB at 1 % of noise. Rare samples that only neighbours have exceed it: with
+# 2.5 a place of a wall without any became 70 % too bright, and with 4 a shot at 8 samples loses 0.05 dB.
+_RELIT = np.float32(2.25)
 # Albedo below that of any surface, by which light is divided in place of black.
 _BLACK = np.float32(1e-3)
 # Rows whose second differences are made at a time.
@@ -224,7 +228,9 @@ def _relative_light(noisy: Floats, neighbours: SampleMean, rate: Floats) -> list
     factors = []
     for sigma in (_SIGMA, _LIGHT):
         together, alone = (gaussian_mean(product, sigma) for product in products)
-        factors.append(np.clip(np.divide(together, alone, out=np.ones_like(alone), where=alone > 0), 0.5, 2))
+        factors.append(
+            np.clip(np.divide(together, alone, out=np.ones_like(alone), where=alone > 0), 1 / _RELIT, _RELIT)
+        )
     return factors
 
 

@@ -154,13 +154,12 @@ CASES: dict[str, tuple[Scene, Edit]] = {
 
 # Worse than their input by 4 to 19 dB where the noise is 1 %: lights of a pixel that one frame shows, which pass for
 # fireflies where fewer than four neighbours tell, and lines of a pixel that cross the motion, so that vectors are not
-# trusted. By 1.5 to 9 dB: fades of parts of the picture, which are not scaled alike.
+# trusted. By 1.5 to 9 dB: a screen whose light stands still while the picture around it fades.
 OPEN = {
     "snow",
     "rain",
     "emitters of black albedo",
     "a screen in a fade",
-    "half the picture fades",
 }
 
 
