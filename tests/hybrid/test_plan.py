@@ -281,16 +281,17 @@ def test_factors_that_noise_hides_in_single_areas_are_found(tmp_path, factors):
         np.testing.assert_allclose(found, np.float64(factors) ** [[1], [-1], [1]], rtol=0.02)
 
 
-def test_light_that_changes_in_places_is_no_fade_in_any_noise(tmp_path):
-    """Half of the areas change by 6 %: what a factor leaves in the others is more than noise."""
+@pytest.mark.parametrize("change", [np.repeat((1.06, 1), 48), np.linspace(1.03, 1.11, 96)], ids=["half", "slope"])
+@pytest.mark.parametrize("noise", [0.01, 0.05])
+def test_light_that_changes_in_places_is_no_fade(tmp_path, change, noise):
+    """A factor leaves more than noise in half of the picture, or at both ends of a slope."""
 
-    def half(index, layers):
-        layers["ViewLayer.Combined"][:, :48] *= np.float32(1.06 ** (index % 2))
+    def alternate(index, layers):
+        layers["ViewLayer.Combined"] *= np.float32(change[:, None] ** (index % 2))
 
-    for noise in (0.01, 0.05):
-        scene = Scene(height=64, width=96, noise=noise, step=(0, 0))
-        stream = FrameStream(open_shot(scene.write(tmp_path / str(noise), edit=half)), Rules(), radius=1)
-        assert [pair.fade for pair in stream.measurements([1001, 1002, 1003])[1]] == [NO_FADE, NO_FADE]
+    scene = Scene(height=64, width=96, noise=noise, step=(0, 0))
+    stream = FrameStream(open_shot(scene.write(tmp_path, edit=alternate)), Rules(), radius=1)
+    assert [pair.fade for pair in stream.measurements([1001, 1002, 1003])[1]] == [NO_FADE, NO_FADE]
 
 
 def test_a_cut_to_other_light_is_a_cut_and_no_fade(tmp_path):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hybrid.files.shots import open_shot
+from hybrid.first_pass import PerFrame
 from hybrid.plan import Context, Rules
 from hybrid.stream import FrameStream, plan_shot
 from tests.scenes import Scene, grained
@@ -199,6 +200,19 @@ def test_neighbours_have_the_light_of_the_centre(tmp_path, noise, factor):
     means = [there.irradiance.mean() for there in frames]
     np.testing.assert_allclose(means, means[1], rtol=0.05)  # other parts of the wall, other noise
     assert means[1] == pytest.approx(FrameStream(shot, Rules()).frame(1003).irradiance.mean())
+
+
+def test_neighbours_have_the_hue_of_the_centre(tmp_path):
+    """Noisy frames and first passes: one factor for all channels leaves a fifth of each."""
+
+    def fade(index, layers):
+        layers["ViewLayer.Combined"] *= np.float32((0.8, 0.6, 0.7)) ** np.float32(index)
+
+    shot = open_shot(Scene(frames=4, noise=0.1).write(tmp_path, edit=fade))
+    window = FrameStream(shot, Rules(), PerFrame(lambda frame: frame.color), radius=1).window(1003)
+    for images in ([there.irradiance for there in window.frames], window.first_pass):
+        means = np.array([image.mean(axis=(0, 1)) for image in images])
+        np.testing.assert_allclose(means, np.broadcast_to(means[1], means.shape), rtol=0.05)
 
 
 def test_a_part_that_changes_leaves_the_light_of_others_alone(tmp_path):
