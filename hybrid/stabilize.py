@@ -55,7 +55,7 @@ class Excess(NamedTuple):
     """By how much a frame as rendered exceeds its picture, where it does so by much."""
 
     bright: Mask  # (H, W): the bright pixels (`nlm.moving_lights.find_bright`)
-    values: Array  # (K,): the excess at these, relative to the picture plus the exposure
+    values: Array  # (K,): the excess at these, relative to what is exceeded plus the exposure
 
     @classmethod
     def of(cls, relative: Array) -> Self:
@@ -299,9 +299,9 @@ class FrameDenoiser:
             seen, trail = self._lights_beyond_picture(number, others), np.zeros(self.stream.shot.shape, bool)
             own, passing = self._results[number].passing, {}
             for time in (-1, 1):
-                there = self._results.get(number + time * step)
-                if there is not None and there.passing is not None:
-                    passing[time] = there.passing.layers, self._vectors(number, number + time * step)
+                there = self._passing_of(number + time * step, number)
+                if there is not None:
+                    passing[time] = there.layers, self._vectors(number, number + time * step)
             if own is not None and passing:
                 lights, (down, right) = passing_lights(*own.layers, passing)
                 seen = seen | lights
@@ -338,6 +338,12 @@ class FrameDenoiser:
             return None
         picture, shown = warp(self._results[beside].denoised.color, flow.vectors)
         return _excess(there, picture, inside=shown)[0]
+
+    def _passing_of(self, number: int, beside: int) -> Excess | None:
+        """The excess of a neighbour over its neighbours' samples too, or else as `_excess_of`."""
+        if "stabilize" in self.stream.rules.allowed:
+            return self._results[number].passing if number in self._results else None
+        return self._excess_of(number, beside) if self.stream.shot.has(number) else None
 
     def _bands(self) -> list[slice]:
         height = self.stream.shot.shape[0]
@@ -381,11 +387,11 @@ def _excess(
     0 where it is not `inside` (H, W).
     """
     shown, rendered = channel_mean(picture), channel_mean(frame.rendered)
-    light = shown + np.float32(measure_exposure(picture))
+    exposure = np.float32(measure_exposure(picture))
 
     def exceed(shown: Array) -> Excess:
         counted = frame.valid if inside is None else frame.valid & inside
-        return Excess.of(np.asarray((rendered - shown) / light * counted, np.float32))
+        return Excess.of(np.asarray((rendered - shown) / (shown + exposure) * counted, np.float32))
 
     if neighbours is None:
         return exceed(shown), None
