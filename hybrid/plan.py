@@ -45,6 +45,9 @@ OUTLIERS_ABOVE = 1e-5  # one firefly in a hundred thousand pixels is twenty in a
 # Upper quartile of |Δalbedo| between frames, along the vectors. Surfaces under film sampling differ by less;
 # with few samples, under depth of field or behind glass by more.
 GUIDE_NOISE_ABOVE = 0.003
+# Light has such noise, as a share of it, at one to four samples a pixel: then renderers may place the samples of all
+# frames alike, so that the noise of guides is the same in all.
+FEW_SAMPLES = 0.5
 RADIUS = 2  # frames on each side of a window as it is planned for a whole shot
 
 
@@ -177,7 +180,11 @@ def measure_stages(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> 
         # Samples show light that moves by less than the noise of a pixel, which no figure of this plan shows.
         _switch("drift", bool(pairs), neighbours),
         _decide_fixed_noise([pair.fixed_noise for pair in pairs]),
-        _decide_prefilter(any(frame.guides for frame in frames), [pair.guide_noise for pair in pairs]),
+        _decide_prefilter(
+            [frame.guide_grain for frame in frames if frame.guide_grain is not None],
+            [pair.guide_noise for pair in pairs],
+            not pairs or max(frame.noise for frame in frames) > FEW_SAMPLES,
+        ),
         _switch("stabilize", bool(pairs), neighbours),
         _switch("restore-mean", clean < 1, f"{1 - clean:.1%} of the tiles hold noise"),
         _switch("blend-samples", True, "each pixel is compared with its samples"),
@@ -251,9 +258,11 @@ def _decide_fixed_noise(figures: Sequence[float]) -> Decision:
     return _decide("fixed-noise", figure, FIXED_NOISE_ABOVE, words)
 
 
-def _decide_prefilter(guides: bool, noise: Iterable[float]) -> Decision:
-    if not guides:
+def _decide_prefilter(grain: Sequence[float], noise: Iterable[float], unknown: bool) -> Decision:
+    if not grain:
         return Decision("prefilter", False, None, GUIDE_NOISE_ABOVE, "no guides in the file")
-    return _decide(
-        "prefilter", max(noise, default=0.0), GUIDE_NOISE_ABOVE, "the guides differ by {:.3f} between frames"
-    )
+    figure, words = max(noise, default=0.0), "the guides differ by {:.3f} between frames"
+    if figure == 0 and unknown:
+        figure = max(grain)
+        words = "the guides differ by {:.3f} from pixel to pixel, and not at all between frames"
+    return _decide("prefilter", figure, GUIDE_NOISE_ABOVE, words)

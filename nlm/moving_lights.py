@@ -100,7 +100,9 @@ def passing_lights(
 
 
 def trail_of(lights: Mask, motion: tuple[int, int], flow: Floats | None, reach: int) -> Mask:
-    """Return the pixels (H, W) of a frame at which neighbours that are aligned with it show lights.
+    """Return the pixels (H, W) of a frame at which neighbours that are aligned with it show lights, or may do so.
+
+    Farther neighbours may show lights that have come over the edge of the picture since the next one.
 
     Parameters
     ----------
@@ -117,6 +119,12 @@ def trail_of(lights: Mask, motion: tuple[int, int], flow: Floats | None, reach: 
         x = np.rint(columns + (time - 1) * motion[1] - time * own[:, 0])
         inside = (y >= 0) & (y < lights.shape[0]) & (x >= 0) & (x < lights.shape[1])
         trail[y[inside].astype(int), x[inside].astype(int)] = True
+    y, x = np.ogrid[: lights.shape[0], : lights.shape[1]]
+    own = np.zeros((1, 1, 2), np.float32) if flow is None else flow
+    for time in range(2, reach + 1):
+        before_y = y - (time - 1) * motion[0] + time * own[..., 1]
+        before_x = x - (time - 1) * motion[1] + time * own[..., 0]
+        trail |= (before_y < 0) | (before_y >= len(y)) | (before_x < 0) | (before_x >= x.size)
     return trail
 
 

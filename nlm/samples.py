@@ -65,13 +65,10 @@ _LAMP = 4.0
 _GLARE = 64.0
 # Least weight of a frame with the centre's geometry and other light.
 _OTHER_LIGHT = 0.02
-# Variance of a warped frame over that of a rendered one (`nlm.variance`).
-_WARPED = np.float32(0.7)
 # The second least squared distance of a sample from N others, over its variance, is 1 / (0.33 N − 0.28) for Gaussian
 # noise that all channels share, and more for other noise. The least one takes a bright sample that a single one of six
-# frames shows as well for light without noise: a sparkle, 0.13 dB of a shot. Of two others the second is the greatest,
-# which snow in either makes noise: there the least one counts, 1 / 1.2 of the variance, at the ends of a shot.
-_SECOND, _FEW, _LEAST = 0.33, 0.28, (1 / (1 + _WARPED), np.float32(1.2))
+# frames shows as well for light without noise: a sparkle, 0.13 dB of a shot.
+_SECOND, _FEW = 0.33, 0.28
 # Deviation, pixels, of the Gaussian over which the light of neighbours is compared with the centre's for the variance,
 # and the share of the noise that this leaves: one of 20 pixels' worth is taken for light. Over 4 pixels light that
 # changes by 2 % a frame passes for 3 % of noise at a rim that one neighbour shows.
@@ -87,6 +84,8 @@ _BLACK = np.float32(1e-3)
 _STRIP = 64
 # Cells per deviation of a mean.
 _CELLS = 4
+# Variance of a warped frame over that of a rendered one (`nlm.variance`).
+_WARPED = np.float32(0.7)
 
 
 class SampleMean(NamedTuple):
@@ -95,7 +94,7 @@ class SampleMean(NamedTuple):
     mean: Floats  # (H, W, 3) radiance; 0 where no frame is trusted
     frames: Floats  # (H, W) frames' worth of samples, (Σ c)² / Σ c², c the confidence; 0 where no frame is trusted
     trust: Floats  # (H, W) in [0, 1]: 1 where the confidence of all frames adds up to 1
-    nearest: Floats  # (H, W) variance of the centre, summed over channels, by the nearest neighbours
+    nearest: Floats  # (H, W) variance of the centre, summed over channels, by the second nearest neighbour
 
 
 def average_neighbours(
@@ -518,8 +517,7 @@ def _average(
                 least, second = min(least, distance), min(max(least, distance), second)
             if total > 0:
                 frames[y, x] = total * total / squares
-                few = count <= len(_LEAST)
-                nearest[y, x] = least * _LEAST[count - 1] if few else second * np.float32(_SECOND * count - _FEW)
+                nearest[y, x] = second * np.float32(_SECOND * count - _FEW) if count > 1 else least / (1 + _WARPED)
                 centre = max(confidence[T // 2, y, x], geometry[T // 2, y, x])
                 trust[y, x] = min(greatest - centre, np.float32(1))
                 for c in range(3):

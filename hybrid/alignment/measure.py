@@ -27,11 +27,15 @@ STILL_NOISE, MOVED_NOISE = 0.05, 1.5
 # Neighbouring half floats differ by at least 2^-11 of their value, and by at most 2^-10: values that differ by less
 # than the first are the same sample, those up to the second are so near by chance.
 SAME, NEAR = 2.0**-12, 2.0**-10
+# Pixels between two of a row at which samples are equal by chance alone; where nearly all are, equal ones tell nothing.
+APART, LEAST_UNEQUAL = 2, 0.02
 # Pixels that differ from their surroundings by less have neither noise nor detail.
 GRAIN = 4 * NEAR
 # Means of 9×9 pixels of guides that differ by more, in units of albedo, show other surfaces; depth of field leaves
 # noise of 0.05 in a pixel, and a tenth of it in these means.
 GUIDE_CHANGE = 0.02
+# Every so many rows are looked at for noise of a frame: all take a tenth of a second at 1920×1080.
+GRAIN_ROWS = 8
 # Areas whose means show changes that noise hides in 9×9 pixels: they must differ by more than a twentieth, and by eight
 # standard errors, as samples that a pixel filter spreads are alike in several pixels.
 AREA, AREA_CHANGE, AREA_NOISE = 32, 0.05, 8.0
@@ -79,7 +83,9 @@ class FrameFacts:
 
     number: int
     albedo_spread: float | None  # standard deviation of the albedo over the frame
-    guides: bool  # whether the frame has albedo or normal
+    noise: float  # median over lit pixels of the noise, or texture, of the size of a pixel in the light, relative to it
+    # upper quartile over pixels of the noise or texture of the size of a pixel in albedo and normal; None without these
+    guide_grain: float | None
     fireflies: int  # number of fireflies that were removed
     outliers: float  # share of the pixels far above all their neighbours, in [0, 1]
     transparent: float | None  # share of the pixels whose alpha is below 0.999
@@ -153,7 +159,8 @@ def measure_frame(frame: PreparedFrame, small: SmallFrame) -> FrameFacts:
     return FrameFacts(
         number=frame.number,
         albedo_spread=None if frame.albedo is None else float(frame.albedo.std()),
-        guides=frame.albedo is not None or frame.normal is not None,
+        noise=_noise(frame.irradiance),
+        guide_grain=_guide_grain([guide for guide in (frame.albedo, frame.normal) if guide is not None]),
         fireflies=frame.fireflies,
         outliers=float(np.mean(rejected)),
         transparent=None if frame.alpha is None else float(np.mean(frame.alpha < 0.999)),
@@ -256,12 +263,10 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool, same:
     shares, figures = [], []
     compared = still & grainy
     if compared.any():
-        distance, greater = np.abs(a - b)[compared], np.maximum(np.abs(a), np.abs(b))[compared]
-        equal, near = (np.count_nonzero(distance <= share * greater) for share in (same, max(NEAR, 2 * same)))
-        shares.append(distance.size)
-        # Noise of a thousandth makes as many halves equal by chance as half of those one step apart; in a fade, where
-        # no step tells, as many as those up to twice as far.
-        figures.append((equal - (near - equal) / (2 if same == SAME else 1)) / distance.size)
+        shares.append(int(compared.sum()))
+        # Samples of a few values, as black or the light of one lamp, are as often equal at other pixels.
+        chance = max(_equal_share(a, np.roll(b, APART, axis=1), compared, same), 0)
+        figures.append((_equal_share(a, b, compared, same) - chance) / max(1 - chance, LEAST_UNEQUAL))
     if moved.sum() > CROP and forth is not None and back is not None:
         d_a = a - channel_mean(_warp_block(there.irradiance, forth[0], block))
         d_b = b - channel_mean(_warp_block(here.irradiance, back[0], block))
@@ -271,16 +276,26 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool, same:
     return float(np.clip(np.average(figures, weights=shares), -1, 1)) if figures else 0.0
 
 
+def _equal_share(a: Array, b: Array, compared: Mask, same: float) -> float:
+    """Share of some pixels at which two images (H, W) have the same sample, less those that are equal by chance."""
+    distance, greater = np.abs(a - b)[compared], np.maximum(np.abs(a), np.abs(b))[compared]
+    equal, near = (np.count_nonzero(distance <= share * greater) for share in (same, max(NEAR, 2 * same)))
+    # Noise of a thousandth makes as many halves equal by chance as half of those one step apart; in a fade, where
+    # no step tells, as many as those up to twice as far.
+    return (equal - (near - equal) / (2 if same == SAME else 1)) / distance.size
+
+
 def equal_noise(here: Array, there: Array, same: float = SAME) -> tuple[Array, Array]:
     """Find pixels at which two frames (H, W, 3) have noise or detail, and those at which it is the same sample.
 
-    The first (H, W) is 1 where both differ from the median of 5×5 pixels by more than 2^-8 of their value, else 0; the
-    second is 1 where they are also equal, as half floats; in a fade that is up to `NEAR`, as both are rounded.
+    The first (H, W) is 1 where both differ from the median of 5×5 pixels by more than 2^-8 of their value, and are not
+    both black, as pixels of few samples are by chance; else 0. The second is 1 where they are also equal, as half
+    floats; in a fade that is up to `NEAR`, as both are rounded.
     """
     a, b = channel_mean(here), channel_mean(there)
     most = np.maximum(np.abs(a), np.abs(b))
     grain = np.minimum(*(np.abs(image - cv2.medianBlur(image, 5)) for image in (a, b)))
-    grainy = grain > GRAIN * most
+    grainy = (grain > GRAIN * most) & (most > 0)
     return grainy.astype(np.float32), (grainy & (np.abs(a - b) <= same * most)).astype(np.float32)
 
 
@@ -506,6 +521,33 @@ def _guide_noise(here: PreparedFrame, there: PreparedFrame, vectors: tuple[Array
         warped = other[grid] if vectors is None else _warp_block(other, vectors[0], grid)
         differences += [*np.moveaxis(np.abs(guide[grid] - warped), -1, 0)]
     return float(np.quantile(np.maximum.reduce(differences), 0.75)) if differences else 0.0
+
+
+def _guide_grain(guides: Sequence[Array]) -> float | None:
+    """Upper quartile over pixels, of those in some rows, of the second differences of guides (H, W, C)."""
+    if not guides:
+        return None
+    grain, shown = np.zeros(1, np.float32), np.zeros(1, bool)
+    for bent, level in map(_second_differences, guides):
+        grain, shown = np.maximum(grain, bent.max(axis=-1)), shown | (level != 0).any(axis=-1)
+    return float(np.quantile(grain[shown], 0.75)) if shown.any() else 0.0
+
+
+def _noise(light: Array) -> float:
+    """Median over pixels, of those in some rows, of the second differences of lit ones, relative to the light."""
+    bent, level = _second_differences(channel_mean(light)[..., None])
+    lit = level > 0
+    return float(np.median(bent[lit] / level[lit])) if lit.any() else 0.0
+
+
+def _second_differences(layer: Array) -> tuple[Array, Array]:
+    """Magnitudes of second differences, as in `flow.guide.estimate_noise`, and means of 3×3 pixels, in some rows."""
+    above, middle, below = (layer[row : len(layer) - 2 + row : GRAIN_ROWS] for row in range(3))
+    parts = above - 2 * middle + below, above + middle + below
+    bent, level = (
+        part[:, :-2] + weight * part[:, 1:-1] + part[:, 2:] for part, weight in zip(parts, (-2, 1), strict=True)
+    )
+    return np.abs(bent) / np.float32(6), level / np.float32(9)
 
 
 def _guide_change(here: PreparedFrame, there: PreparedFrame, vectors: tuple[Array, Mask] | None = None) -> float:

@@ -424,6 +424,17 @@ def test_what_a_renderer_documents_holds_beside_a_render_region(region) -> None:
     assert choice.unexplained < 0.05 < 0.2 < choice.still
 
 
+@pytest.mark.parametrize("lit", [0.1, 0.3])
+@pytest.mark.parametrize("pan", [(0, 0), (8, 3)])
+def test_black_pixels_of_few_samples_contradict_nothing(pan, lit) -> None:
+    """Most of a patch was black by chance, and the mean of the rest was taken for that of all of it."""
+    film, rng = Film(pan, noise=0), np.random.default_rng(6)
+    colors = [color * (rng.random((HEIGHT, WIDTH, 1)) < lit).astype(np.float32) / lit for color in film.colors]
+    layers = [np.float32(np.dstack([film.previous(n), -film.next(n)]) * [1, -1, 1, -1]) for n in range(3)]
+    pairs = [Patches(FramePair(colors[n], colors[n + 1], layers[n], layers[n + 1], (HEIGHT, WIDTH))) for n in range(2)]
+    assert choose_convention(pairs, CYCLES).convention == CYCLES
+
+
 def test_a_moving_sky_without_vectors_counts_for_nothing() -> None:
     rng = np.random.default_rng(2)
     pictures, layers = [block_on_black(n, 30, 3) for n in (0, 1)], []

@@ -110,6 +110,22 @@ def test_noise_in_the_guides_calls_for_prefiltering(tmp_path):
     assert decisions(Scene().write(tmp_path / "noisy", edit=blur))["prefilter"].on
 
 
+@pytest.mark.parametrize(("frames", "noise", "filtered"), [(1, 0.1, True), (3, 1.5, True), (3, 0.1, False)])
+def test_noise_that_all_guides_share_calls_for_prefiltering(tmp_path, frames, noise, filtered):
+    """Cycles makes the guides of one sample a pixel alike in all frames, which then do not differ; nor does one."""
+
+    def blur(index, layers):
+        grain = np.random.default_rng(3).normal(0, 0.1, layers["ViewLayer.Denoising Albedo"].shape)
+        layers["ViewLayer.Denoising Albedo"] += grain.astype(np.float32)
+
+    def smooth(index, layers):
+        layers["ViewLayer.Denoising Albedo"][:] = 0.5
+
+    scene = Scene(frames=frames, step=(0, 0), noise=noise)
+    assert not decisions(scene.write(tmp_path / "smooth", edit=smooth))["prefilter"].on
+    assert decisions(scene.write(tmp_path / "noisy", edit=blur))["prefilter"].on == filtered
+
+
 def test_without_albedo_there_is_no_demodulation(tmp_path):
     found = decisions(Scene().write(tmp_path, without={"Denoising Albedo"}))
     assert not found["demodulate"].on

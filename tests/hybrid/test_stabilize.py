@@ -555,7 +555,9 @@ class TestSamples:
         # The light of the flakes, 3 % of the frame's, went into the mean of all other pixels too.
         assert result[elsewhere].mean() == pytest.approx(truth(scene, number)[elsewhere].mean(), rel=0.005)
 
-    def test_rain_that_a_denoiser_keeps_is_no_noise(self, tmp_path):
+    @pytest.mark.parametrize("place", [0, 2], ids=["first", "middle"])
+    @pytest.mark.parametrize("rules", [Rules(), Rules(off=frozenset({"stabilize"}))], ids=["network", "classical"])
+    def test_rain_that_a_denoiser_keeps_is_no_noise(self, tmp_path, rules, place):
         """Streaks that the picture shows: what each frame alone shows was taken for noise, and its detail was lost."""
         drops = np.random.default_rng(5).integers(0, (96, 160), (60, 2))
         scene = Scene(height=96, width=160, frames=5, step=(0, 0), noise=0.01)
@@ -568,15 +570,15 @@ class TestSamples:
                 color[rows[inside], columns[inside]] += 3
 
         shot = open_shot(scene.write(tmp_path, edit=rain))
-        number, clean = scene.first + 2, scene.clean(2)
-        rain(2, clean)
+        number, clean = scene.first + place, scene.clean(place)
+        rain(place, clean)
         right = clean["ViewLayer.Combined"]
 
         def soft(aligned):
             picture = cv2.GaussianBlur(aligned.centre_irradiance * aligned.modulation, (0, 0), 0.4)
             return Denoised(np.ascontiguousarray(picture))
 
-        result = made(shot, soft, number, Rules(), first_pass=PerFrame(lambda frame: frame.color))
+        result = made(shot, soft, number, rules, first_pass=PerFrame(lambda frame: frame.color))
         assert np.std(result - right) < 1.1 * np.std(shot.read(number).color - right)
 
 

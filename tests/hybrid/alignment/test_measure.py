@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -42,3 +44,21 @@ def test_noise_of_a_thousandth_is_not_taken_for_the_noise_of_one_seed(noise, hal
     grains = rng.normal(1, noise, (2, 96, 128, 1))
     assert abs(fixed_noise(frame(1, grains[0]), frame(2, grains[1]), moves=False)) < 0.6 * FIXED_NOISE_ABOVE
     assert fixed_noise(frame(1, grains[0]), frame(2, grains[0]), moves=False) == pytest.approx(1, abs=0.01)
+
+
+@pytest.mark.parametrize("lit", [0.1, 0.5])
+def test_pixels_that_one_sample_hits_or_misses_have_no_fixed_noise(lit):
+    """Most pixels were equal by chance: black, or with the whole light of a lamp."""
+    rng = np.random.default_rng(4)
+    hits = (rng.random((2, 96, 128, 1)) < lit) * np.ones(3, np.float32) / lit
+    first, second = (prepare(Frame(number=n, color=hit)) for n, hit in enumerate(hits))
+    assert abs(fixed_noise(first, second, moves=False)) < 0.3 * FIXED_NOISE_ABOVE
+    light = rng.uniform(0.5, 1, (2, 96, 128, 1)).astype(np.float32)
+    first, second = (prepare(Frame(number=n, color=hit)) for n, hit in enumerate(hits * light))
+    again = replace(first, number=2)
+    assert abs(fixed_noise(first, second, moves=False)) < 0.3 * FIXED_NOISE_ABOVE
+    assert fixed_noise(first, again, moves=False) == pytest.approx(1, abs=0.01)
+    grainy, equal = equal_noise(first.irradiance, second.irradiance)
+    assert grainy.any()
+    assert not equal.any()
+    assert repeats(first.irradiance, again.irradiance)
