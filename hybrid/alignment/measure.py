@@ -35,7 +35,7 @@ GRAIN = 4 * NEAR
 # noise of 0.05 in a pixel, and a tenth of it in these means.
 GUIDE_CHANGE = 0.02
 # Every so many rows are looked at for noise of a frame: all take a tenth of a second at 1920×1080.
-GRAIN_ROWS = 8
+GRAIN_ROWS = 16
 # Areas whose means show changes that noise hides in 9×9 pixels: they must differ by more than a twentieth, and by eight
 # standard errors, as samples that a pixel filter spreads are alike in several pixels.
 AREA, AREA_CHANGE, AREA_NOISE = 32, 0.05, 8.0
@@ -529,19 +529,19 @@ def _guide_grain(guides: Sequence[Array]) -> float | None:
         return None
     grain, shown = np.zeros(1, np.float32), np.zeros(1, bool)
     for bent, level in map(_second_differences, guides):
-        grain, shown = np.maximum(grain, bent.max(axis=-1)), shown | (level != 0).any(axis=-1)
+        grain, shown = np.maximum(grain, np.abs(bent).max(axis=-1)), shown | (level != 0).any(axis=-1)
     return float(np.quantile(grain[shown], 0.75)) if shown.any() else 0.0
 
 
 def _noise(light: Array) -> float:
     """Median over pixels, of those in some rows, of the second differences of lit ones, relative to the light."""
-    bent, level = _second_differences(channel_mean(light)[..., None])
+    bent, level = (part.mean(axis=-1) for part in _second_differences(light))
     lit = level > 0
-    return float(np.median(bent[lit] / level[lit])) if lit.any() else 0.0
+    return float(np.median(np.abs(bent[lit]) / level[lit])) if lit.any() else 0.0
 
 
 def _second_differences(layer: Array) -> tuple[Array, Array]:
-    """Magnitudes of second differences, as in `flow.guide.estimate_noise`, and means of 3×3 pixels, in some rows."""
+    """Second differences, as in `flow.guide.estimate_noise`, and means of 3×3 pixels, in some rows."""
     above, middle, below = (layer[row : len(layer) - 2 + row : GRAIN_ROWS] for row in range(3))
     parts = above - 2 * middle + below, above + middle + below
     bent, level = (
