@@ -282,7 +282,7 @@ def _equal_share(a: Array, b: Array, compared: Mask, same: float) -> float:
     equal, near = (np.count_nonzero(distance <= share * greater) for share in (same, max(NEAR, 2 * same)))
     # Noise of a thousandth makes as many halves equal by chance as half of those one step apart; in a fade, where
     # no step tells, as many as those up to twice as far.
-    return (equal - (near - equal) / (2 if same == SAME else 1)) / distance.size
+    return float((equal - (near - equal) / (2 if same == SAME else 1)) / distance.size)
 
 
 def equal_noise(here: Array, there: Array, same: float = SAME) -> tuple[Array, Array]:
@@ -314,10 +314,10 @@ def repeats(here: Array, there: Array, same: float = SAME) -> bool:
 
 
 def noise_free_around(frame: PreparedFrame, places: Places) -> Mask:
-    """Return whether there is no noise in the light around places (K, 2); False where hardly any pixel is lit.
+    """Return whether there is no noise around places (K, 2); False where hardly any pixel is lit.
 
-    A pixel's light, color over albedo, is then the mean of those on two sides of it, as far as halves tell. What shows
-    no noise is seen or lit directly, and has no fireflies.
+    A pixel's color, or its light, color over albedo, is then the mean of those on two sides of it, as far as halves
+    tell. What shows no noise is seen or lit directly, and has no fireflies.
     """
     lit, straight = np.zeros((2, len(places)), int)
     near, (height, width) = np.arange(-AROUND, AROUND + 1), frame.valid.shape
@@ -326,15 +326,19 @@ def noise_free_around(frame: PreparedFrame, places: Places) -> Mask:
         y, x = (places[some, axis, None] + near for axis in (0, 1))
         inside = ((y >= 0) & (y < height))[:, :, None] & ((x >= 0) & (x < width))[:, None]
         rows, columns = np.clip(y, 0, height - 1)[:, :, None], np.clip(x, 0, width - 1)[:, None]
-        light, divisor = frame.irradiance[rows, columns], frame.divisor_at(rows, columns)
+        color, divisor = frame.irradiance[rows, columns], frame.divisor_at(rows, columns)
+        shown = [color]
         if divisor is not None:
-            light = light * divisor / np.maximum(divisor - np.float32(ALBEDO_FLOOR), BLACK)
-        level = np.where(inside, light.mean(axis=-1), np.float32(0))
-        centre = level[:, 1:-1, 1:-1]
-        sides = level[:, 1:-1, :-2] + level[:, 1:-1, 2:], level[:, :-2, 1:-1] + level[:, 2:, 1:-1]
-        off = np.minimum(*(np.abs(side / 2 - centre) for side in sides))
-        lit[some] = (centre > 0).sum(axis=(1, 2))
-        straight[some] = ((centre > 0) & (off <= 2 * NEAR * centre)).sum(axis=(1, 2))
+            color = color * divisor
+            shown = [color, color / np.maximum(divisor - np.float32(ALBEDO_FLOOR), BLACK)]
+        for layer in shown:
+            level = np.where(inside, layer.mean(axis=-1), np.float32(0))
+            centre = level[:, 1:-1, 1:-1]
+            sides = level[:, 1:-1, :-2] + level[:, 1:-1, 2:], level[:, :-2, 1:-1] + level[:, 2:, 1:-1]
+            off = np.minimum(*(np.abs(side / 2 - centre) for side in sides))
+            lit[some] = (centre > 0).sum(axis=(1, 2))
+            count = ((centre > 0) & (off <= 2 * NEAR * centre)).sum(axis=(1, 2))
+            straight[some] = np.maximum(straight[some], count)
     return np.asarray((lit >= LIT) & (straight >= STRAIGHT * lit))
 
 

@@ -225,6 +225,19 @@ def test_a_part_that_changes_leaves_the_light_of_others_alone(tmp_path):
     )
 
 
+def test_equal_frames_of_one_color_under_textured_guides_are_no_frame_shown_twice(tmp_path):
+    """Color over albedo, a texture, passed for noise: a warning said that a constant picture has one seed."""
+
+    def plain(_, layers):
+        layers["ViewLayer.Combined"][:] = 0.5
+
+    scene = Scene(frames=2, step=(0, 0), height=80, width=96)
+    stream = FrameStream(open_shot(scene.write(tmp_path, edit=plain)), Rules(), radius=1)
+    _, (pair,) = stream.measurements([1001, 1002])
+    assert not pair.repeated
+    assert pair.fixed_noise == 0
+
+
 @pytest.mark.parametrize("noise", [0, 0.1])
 def test_equal_frames_without_noise_are_no_frame_shown_twice(tmp_path, noise):
     """A still shot without noise lost all of its small lamps: no other frame counted as their witness."""
