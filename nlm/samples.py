@@ -54,6 +54,9 @@ _MEANS = (48.0, 1.0, 800.0, 1), (12.0, 7.0, 300.0, 1), (48.0, 4.0, 1000.0, 4)
 # correlates its light with the samples: with bins of 2 stops the classical chain loses 0.44 dB of a shot at 8 samples,
 # with 6 it loses 0.04.
 _STOPS = np.float32(6)
+# Samples that make the noise of the whole picture, without which its mean is not known: two pictures in which 30 to 60
+# bright ones do at 512 samples lose 0.1 and 1.5 dB by a mean of their own variance.
+_FEWEST = 60
 # Limit of the distance of a sample from the picture when means are compared, in units of the light. Limits of 20 to 200
 # restore the mean equally well; 6 leaves 1 % where lamps are small.
 _FAR = np.float32(20)
@@ -348,8 +351,10 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
     the noise: five fireflies determine neither a mean nor its variance. The weight u keeps the light of all pixels
     but those much brighter than their surroundings, which count by their relative error: a lamp that is too bright
     darkens nothing around it. The means over σ = 48 pixels come first (k = 1, f = 800), then those over 12 (7, 300),
-    and last those over 48 (4, 1000) of pixels of similar light: K is then over each of 4 bins of six stops, a = 0,
-    and a pixel counts in the two bins next to it.
+    and then those over 48 (4, 1000) of pixels of similar light: K is then over each of 4 bins of six stops, a = 0,
+    and a pixel counts in the two bins next to it. Last, with K the mean of the whole picture, of which u is one over
+    the mean, the picture becomes (1 + s D) picture, s = max(0, 1 − v / D² − (60 / N)²): right in the relative light, it
+    is too dark where it has too little contrast.
     """
     picture, noisy = (np.ascontiguousarray(image, np.float32) for image in (picture, noisy))
     for sigma, certain, few, bins in _MEANS:
@@ -373,7 +378,26 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
         changes, restored = np.concatenate([around, changes]), np.empty_like(picture)
         run_bands(_restore, len(picture), picture, changes, dark, rows, columns, restored)
         picture = restored
-    return picture
+    factor = _known_factor(channel_mean(picture), channel_mean(noisy), np.float32(1e-3 * exposure))
+    return picture if factor == 1 else picture * factor
+
+
+def _known_factor(light: Floats, noisy: Floats, dark: np.float32) -> np.float32:
+    """Factor from the mean of a picture's light (H, W) to that of the samples, as far as it is known."""
+    mean, reach = light.mean(dtype=np.float64), _FAR * (light + dark)
+    if not mean > 0:
+        return np.float32(1)
+    difference = noisy - light
+    counted = np.clip(difference, -reach, reach) / np.float32(mean)
+    change, cut = counted.mean(dtype=np.float64), difference.mean(dtype=np.float64) / mean
+    cut -= change
+    change += np.clip(-change, min(cut, 0), max(cut, 0))
+    noise, fourth = (np.power(counted, order).mean(dtype=np.float64) for order in (2, 4))
+    if not (change and noise):
+        return np.float32(1)
+    samples = counted.size * noise**2 / fourth
+    share = max(0, 1 - noise / counted.size / change**2 - (_FEWEST / samples) ** 2)
+    return np.float32(1 + share * change)
 
 
 def _known_changes(sums: Floats, pixels: np.float32, certain: np.float32, few: np.float32) -> Floats:

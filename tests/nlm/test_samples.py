@@ -433,3 +433,24 @@ def test_light_of_rare_samples_darkens_no_picture(wrong):
     restored = restore_mean(np.float32(wrong) * wall, rendered, 0.2)
     assert restored.mean() / 0.2 > min(wrong, 1) - 0.05  # 0.2 without the light that is cut
     assert restored.mean() / 0.2 < max(wrong, 1) + 0.05
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1, 1e6])
+def test_the_light_of_a_picture_with_too_little_contrast_is_restored(scale: float) -> None:
+    """It was right in the mean of relative light, and 1 % too dark."""
+    rng = np.random.default_rng(21)
+    grain = cv2.GaussianBlur(rng.standard_normal((64, 96)).astype(np.float32), (0, 0), 1.5)
+    shape = grain[..., None] * ONES[:64, :96] / grain.std()
+    truth, flat = (np.float32(0.2 * scale) * np.exp(np.float32(contrast) * shape) for contrast in (0.7, 0.6))
+    noise = np.float32(0.4) * rng.standard_normal((64, 96, 1)).astype(np.float32)
+    picture = flat * np.median(truth / flat)
+    assert picture.mean() / truth.mean() < 0.96
+    restored = restore_mean(picture, truth * (1 + noise), 0.2 * scale)
+    assert restored.mean() == pytest.approx((truth * (1 + noise)).mean(), rel=0.005)
+
+
+def test_a_mean_of_the_whole_picture_that_few_samples_make_is_not_known() -> None:
+    picture = np.full((64, 96, 3), 0.2, np.float32)
+    noisy = picture.copy()
+    noisy[::16, ::16] += 3  # 24 samples
+    np.testing.assert_array_equal(restore_mean(picture, noisy, 0.2), picture)
