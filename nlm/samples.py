@@ -352,9 +352,9 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
     but those much brighter than their surroundings, which count by their relative error: a lamp that is too bright
     darkens nothing around it. The means over σ = 48 pixels come first (k = 1, f = 800), then those over 12 (7, 300),
     and then those over 48 (4, 1000) of pixels of similar light: K is then over each of 4 bins of six stops, a = 0,
-    and a pixel counts in the two bins next to it. Last, with K the mean of the whole picture, of which u is one over
-    the mean, the picture becomes (1 + s D) picture, s = max(0, 1 − v / D² − (60 / N)²): right in the relative light, it
-    is too dark where it has too little contrast.
+    and a pixel counts in the two bins next to it. Last, with K the mean of the whole picture and
+    u one over the mean, the picture becomes (1 + s D w / K(w u l)) picture, w = u l / (u l + 1), s = max(0, 1 − v / D²
+    − (60 / N)²): right in the relative light, a picture of too little contrast is too dark where it is bright.
     """
     picture, noisy = (np.ascontiguousarray(image, np.float32) for image in (picture, noisy))
     for sigma, certain, few, bins in _MEANS:
@@ -378,15 +378,14 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
         changes, restored = np.concatenate([around, changes]), np.empty_like(picture)
         run_bands(_restore, len(picture), picture, changes, dark, rows, columns, restored)
         picture = restored
-    factor = _known_factor(channel_mean(picture), channel_mean(noisy), np.float32(1e-3 * exposure))
-    return picture if factor == 1 else picture * factor
+    return _with_mean(picture, channel_mean(picture), channel_mean(noisy), np.float32(1e-3 * exposure))
 
 
-def _known_factor(light: Floats, noisy: Floats, dark: np.float32) -> np.float32:
-    """Factor from the mean of a picture's light (H, W) to that of the samples, as far as it is known."""
+def _with_mean(picture: Floats, light: Floats, noisy: Floats, dark: np.float32) -> Floats:
+    """Give a picture of a light (H, W) the mean of the whole frame's samples, as far as it is known."""
     mean, reach = light.mean(dtype=np.float64), _FAR * (light + dark)
     if not mean > 0:
-        return np.float32(1)
+        return picture
     difference = noisy - light
     counted = np.clip(difference, -reach, reach) / np.float32(mean)
     change, cut = counted.mean(dtype=np.float64), difference.mean(dtype=np.float64) / mean
@@ -394,10 +393,15 @@ def _known_factor(light: Floats, noisy: Floats, dark: np.float32) -> np.float32:
     change += np.clip(-change, min(cut, 0), max(cut, 0))
     noise, fourth = (np.power(counted, order).mean(dtype=np.float64) for order in (2, 4))
     if not (change and noise):
-        return np.float32(1)
+        return picture
     samples = counted.size * noise**2 / fourth
     share = max(0, 1 - noise / counted.size / change**2 - (_FEWEST / samples) ** 2)
-    return np.float32(1 + share * change)
+    if not share:
+        return picture
+    bright = np.maximum(light, 0)
+    bright /= bright + np.float32(mean)
+    factor = np.float32(share * change * mean / np.mean(bright * light, dtype=np.float64)) * bright
+    return np.asarray(picture * (1 + factor)[..., None])
 
 
 def _known_changes(sums: Floats, pixels: np.float32, certain: np.float32, few: np.float32) -> Floats:
