@@ -391,11 +391,12 @@ def _with_mean(picture: Floats, light: Floats, noisy: Floats, dark: np.float32) 
     change, cut = counted.mean(dtype=np.float64), difference.mean(dtype=np.float64) / mean
     cut -= change
     change += np.clip(-change, min(cut, 0), max(cut, 0))
-    noise, fourth = (np.power(counted, order).mean(dtype=np.float64) for order in (2, 4))
+    squares = np.square(counted, out=counted)
+    noise = squares.mean(dtype=np.float64)
     if not (change and noise):
         return picture
-    samples = counted.size * noise**2 / fourth
-    share = max(0, 1 - noise / counted.size / change**2 - (_FEWEST / samples) ** 2)
+    samples = squares.size / np.square(squares / np.float32(noise)).mean(dtype=np.float64)
+    share = max(0, 1 - noise / squares.size / change**2 - (_FEWEST / samples) ** 2)
     if not share:
         return picture
     bright = np.maximum(light, 0)
