@@ -45,8 +45,8 @@ OUTLIERS_ABOVE = 1e-5  # one firefly in a hundred thousand pixels is twenty in a
 # Upper quartile of |Δalbedo| between frames, along the vectors. Surfaces under film sampling differ by less;
 # with few samples, under depth of field or behind glass by more.
 GUIDE_NOISE_ABOVE = 0.003
-# Light has such noise, as a share of it, at one to four samples a pixel: then renderers may place the samples of all
-# frames alike, so that the noise of guides is the same in all.
+# Light has more noise than this, as a share of it, at one or two samples a pixel, and in dim rooms at 30. With one
+# sample Cycles makes the guides of all frames alike, their noise included.
 FEW_SAMPLES = 0.5
 RADIUS = 2  # frames on each side of a window as it is planned for a whole shot
 

@@ -16,6 +16,7 @@ from hybrid.files.frame import Array
 from loops.parallel import Doubles, Mask, Places
 from nlm.average import channel_mean, reject_outliers
 from nlm.gate import color_gate
+from nlm.variance import second_differences
 
 # Rows to which frames are reduced for measuring: a mean of k×k pixels has a k-th of their noise, and a k²-th of their
 # cost. Frames below twice this are not reduced.
@@ -83,7 +84,7 @@ class FrameFacts:
 
     number: int
     albedo_spread: float | None  # standard deviation of the albedo over the frame
-    noise: float  # median over lit pixels of the noise, or texture, of the size of a pixel in the light, relative to it
+    noise: float  # median over lit pixels of the noise, or texture, of a pixel relative to its light
     # upper quartile over pixels of the noise or texture of the size of a pixel in albedo and normal; None without these
     guide_grain: float | None
     fireflies: int  # number of fireflies that were removed
@@ -545,13 +546,12 @@ def _noise(light: Array) -> float:
 
 
 def _second_differences(layer: Array) -> tuple[Array, Array]:
-    """Second differences, as in `flow.guide.estimate_noise`, and means of 3×3 pixels, in some rows."""
-    above, middle, below = (layer[row : len(layer) - 2 + row : GRAIN_ROWS] for row in range(3))
-    parts = above - 2 * middle + below, above + middle + below
-    bent, level = (
-        part[:, :-2] + weight * part[:, 1:-1] + part[:, 2:] for part, weight in zip(parts, (-2, 1), strict=True)
-    )
-    return np.abs(bent) / np.float32(6), level / np.float32(9)
+    """Second differences, in units of the noise, and means of 3×3 pixels, in some rows of a layer (H, W, C)."""
+    rows = np.arange(1, len(layer) - 1, GRAIN_ROWS)[:, None] + np.arange(-1, 2)  # with one on each side
+    if not rows.size:
+        return layer[:0], layer[:0]
+    strips = layer[rows.ravel()]
+    return second_differences(strips)[1::3] / np.float32(6), np.asarray(cv2.blur(strips, (3, 3)), np.float32)[1::3]
 
 
 def _guide_change(here: PreparedFrame, there: PreparedFrame, vectors: tuple[Array, Mask] | None = None) -> float:
