@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from network.devices import DEVICES
 
 LOSSES = ("l1", "smape", "relmse", "display", "perceptual")
+AGAINST = ("input", "start")
 TERMS = ("temporal", "power", "spatial")
 
 
@@ -45,6 +46,8 @@ class TrainConfig:
     # relmse leaves the mean alone.
     loss: str = "relmse"
     vgg: str | None = None
+    # By default "start" for given weights, else "input".
+    against: str | None = None
     terms: str | None = None
     whole: float = 1.0
     differences: float = 0.0
@@ -68,9 +71,9 @@ class TrainConfig:
             raise ValueError(f"backbone_rate: expected 0 to 1, got {self.backbone_rate}")
         if not 0 <= self.ema < 1:
             raise ValueError(f"ema: expected 0 <= ema < 1, got {self.ema}")
-        for name, choices in (("loss", LOSSES), ("terms", TERMS), ("device", DEVICES)):
+        for name, choices in (("loss", LOSSES), ("against", AGAINST), ("terms", TERMS), ("device", DEVICES)):
             value = getattr(self, name)
-            if value not in choices and not (name == "terms" and value is None):
+            if value not in choices and not (name in ("against", "terms") and value is None):
                 raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
         if (self.loss == "perceptual") != (self.vgg is not None):
             raise ValueError("vgg: expected weights with the perceptual loss, and only with it")

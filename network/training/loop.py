@@ -20,6 +20,7 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader
 
@@ -35,6 +36,13 @@ from network.training.clips import Clips, Sample, Samples, whole_frames
 from network.training.config import TrainConfig
 from network.training.perceptual import Perceptual, load_vgg19
 from network.windows import UNetWindow
+
+#: Share of the starting network's error from which on a crop counts, with `TrainConfig.against` "start": gains beyond
+#: 15 % of a crop would pay for losses in others.
+ENOUGH = 0.85
+#: Least error of the starting network in a crop, over that of the clip's best input: nothing is lost in a crop that is
+#: nearly right already.
+LEAST = 0.05
 
 
 def predict(
@@ -79,9 +87,18 @@ def image_loss(config: TrainConfig) -> losses.ImageLoss:
 
 
 def batch_loss(
-    model: Model, batch: Sample, config: TrainConfig, loss: losses.ImageLoss, run: Callable[..., Any] | None = None
+    model: Model,
+    batch: Sample,
+    config: TrainConfig,
+    loss: losses.ImageLoss,
+    run: Callable[..., Any] | None = None,
+    start: Model | None = None,
 ) -> Tensor:
     """Training loss of a batch: mean of log(1 + loss of each crop, relative to that of its clip's best input).
+
+    With `start`, the network that the training began with, it is the mean of max(0, q − `ENOUGH`)², with q the crop's
+    loss over that of `start`, and a straight line from half beyond `ENOUGH` on: the network is to be no worse anywhere,
+    rather than much better in a few places.
 
     Possible gains differ by orders of magnitude between shots, and the targets' noise adds a floor. Each crop's loss is
     divided by that of its whole clip's best input (the mean of the window weighted by confidence, or the centre's first
@@ -90,6 +107,18 @@ def batch_loss(
     should not. The logarithm is for the few crops that are twenty times worse than their clip: one of them would undo
     the gradients of a hundred others.
     """
+    if start is not None:
+        with torch.no_grad():
+            before = _crop_losses(start, batch, config, loss)
+        ratio = _crop_losses(model, batch, config, loss, run) / before.clamp_min(LEAST)
+        return losses.bent_square(functional.relu(ratio - ENOUGH), 0.5).mean()
+    return torch.log1p(_crop_losses(model, batch, config, loss, run)).mean()
+
+
+def _crop_losses(
+    model: Model, batch: Sample, config: TrainConfig, loss: losses.ImageLoss, run: Callable[..., Any] | None = None
+) -> Tensor:
+    """Loss (N,) of each crop over that of its clip's best input."""
     if neighbours := config.differences > 0:
         batch = Sample(*(pair.flatten(0, 1) for pair in batch))
     output = predict(model, batch, not config.float32, run)
@@ -108,7 +137,7 @@ def batch_loss(
         trust = batch.confidence[::2, min(after, color.shape[1] - 1)]
         flicker = losses.difference_loss(loss, image, target, modulation, exposure, batch.to_next[::2], trust)
         value = value.unflatten(0, (-1, 2)).mean(1) + config.differences * flicker / error.mean(1)
-    return torch.log1p(value).mean()
+    return value
 
 
 @torch.no_grad()
@@ -173,8 +202,10 @@ def train(
     state_path = Path(f"{os.fspath(out)}.state")
     channels_last(model.to(device).train())
     average = copy.deepcopy(model).requires_grad_(False)
+    start = copy.deepcopy(average) if config.against == "start" else None
     groups = _groups(model, config.backbone_rate)
     optimizer = torch.optim.AdamW(groups, lr=config.rate, weight_decay=config.weight_decay)
+    saved: dict[str, Any] = {"model": model, "average": average, "start": start, "optimizer": optimizer}
     # These settings may change between an interruption and its resumption.
     fixed = {name: value for name, value in asdict(config).items() if name not in ("validate_minutes", "workers")}
     identity = json.dumps({"model": describe(model), "training": fixed}, sort_keys=True)
@@ -184,9 +215,9 @@ def train(
     history: list[dict[str, float]] = []
     if resume:
         state = _read_state(state_path, identity)
-        model.load_state_dict(state["model"])
-        average.load_state_dict(state["average"])
-        optimizer.load_state_dict(state["optimizer"])
+        for name, module in saved.items():
+            if module is not None:
+                module.load_state_dict(state[name])
         progress = json.loads(state["progress"])
         step, before, history = progress["step"], progress["seconds"], progress["history"]
     loss_of_image = image_loss(config)
@@ -205,15 +236,15 @@ def train(
     def write_weights() -> None:
         save_model(out, average, {"training": asdict(config), "validation": history})
 
-    start = time.monotonic() - before
+    started = time.monotonic() - before
     checkpointed = before
     values: list[float] = []
-    while (done := _done(config, step, _agreed(time.monotonic() - start, device))) < 1:
+    while (done := _done(config, step, _agreed(time.monotonic() - started, device))) < 1:
         rate = config.rate * _rate(config, step, done)
         for group, part in zip(optimizer.param_groups, groups, strict=True):
             group["lr"] = rate * part["share"]
         batch = Sample(*(value.to(device, non_blocking=True) for value in next(batches)))
-        loss = batch_loss(model, batch, config, loss_of_image, run)
+        loss = batch_loss(model, batch, config, loss_of_image, run, start)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         norm = float(nn.utils.clip_grad_norm_(model.parameters(), config.clip_norm))
@@ -224,7 +255,7 @@ def train(
         values.append(loss.item())
         if rank:
             continue
-        now = time.monotonic() - start
+        now = time.monotonic() - started
         done = _done(config, step, now)
         log(step, {"train/loss": values[-1], "train/rate": rate, "train/norm": norm, "done": done, "seconds": now})
         if now - checkpointed > 60 * config.validate_minutes:
@@ -232,8 +263,8 @@ def train(
                 validate_average()
             write_weights()
             progress = {"step": step, "seconds": now, "history": history}
-            _write_state(state_path, identity, model, average, optimizer, progress)
-            checkpointed = time.monotonic() - start
+            _write_state(state_path, identity, saved, progress)
+            checkpointed = time.monotonic() - started
     if rank == 0:
         if len(validation):
             validate_average()
@@ -301,18 +332,11 @@ def _follow(average: nn.Module, model: nn.Module, decay: float) -> None:
     torch._foreach_lerp_(list(average.parameters()), list(model.parameters()), 1 - decay)
 
 
-def _write_state(
-    path: Path, identity: str, model: Model, average: Model, optimizer: torch.optim.Optimizer, progress: dict[str, Any]
-) -> None:
-    """Everything the next step depends on; replaces the last state whole."""
+def _write_state(path: Path, identity: str, parts: dict[str, Any], progress: dict[str, Any]) -> None:
+    """Everything the next step depends on, of modules and optimizer; replaces the last state whole."""
     partial = new_partial(path)
-    state = {
-        "identity": identity,
-        "model": model.state_dict(),
-        "average": average.state_dict(),
-        "optimizer": optimizer.state_dict(),
-        "progress": json.dumps(progress),
-    }
+    state = {name: part.state_dict() for name, part in parts.items() if part is not None}
+    state |= {"identity": identity, "progress": json.dumps(progress)}
     torch.save(state, partial)
     os.replace(partial, path)
 

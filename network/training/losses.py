@@ -62,7 +62,7 @@ def relmse(
     """
     level = prediction.detach().mean(1, keepdim=True)
     relative = (prediction - target) * torch.rsqrt(level**2 + RELMSE_FLOOR * scale.view(-1, 1, 1, 1) ** 2)
-    return _mean(_bent_square(relative, limit), weight)
+    return _mean(bent_square(relative, limit), weight)
 
 
 def display(
@@ -79,7 +79,7 @@ def display(
     """
     level = scale.view(-1, 1, 1, 1)
     slope = level / (functional.relu(prediction.detach()) + level).square()
-    return _mean(_bent_square((prediction - target) * slope, limit), weight)
+    return _mean(bent_square((prediction - target) * slope, limit), weight)
 
 
 def frame_pairs(frames: int) -> list[tuple[int, int]]:
@@ -199,7 +199,7 @@ def scale_of_radiance(scale: Tensor, modulation: Tensor) -> Tensor:
     return scale * modulation.mean((1, 2, 3)).clamp_min(1e-3)
 
 
-def _bent_square(errors: Tensor, limit: float) -> Tensor:
+def bent_square(errors: Tensor, limit: float) -> Tensor:
     """Quadratic inside the limit, tangent outside (Huber)."""
     # The minimum keeps an infinite limit from making inf − inf.
     size = errors.abs()

@@ -243,6 +243,7 @@ OPTIONS = {
     "ema": (["--ema", 0.9], 0.9),
     "loss": (["--loss", "perceptual"], "perceptual"),
     "vgg": (["--vgg", "vgg.pth"], "vgg.pth"),
+    "against": (["--against", "start"], "start"),
     "terms": (["--terms", "power"], "power"),
     "whole": (["--whole", 0.25], 0.25),
     "differences": (["--differences", 0.75], 0.75),

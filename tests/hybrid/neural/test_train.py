@@ -12,6 +12,7 @@ from hybrid.neural.train import TrainInputs, _initial_model  # noqa: E402
 from network.checkpoint import load_model, shipped_weights  # noqa: E402
 from network.oidn_weights import load_oidn  # noqa: E402
 from network.presets import build_preset  # noqa: E402
+from network.training.config import TrainConfig  # noqa: E402
 
 pytestmark = pytest.mark.neural
 
@@ -59,6 +60,28 @@ def test_oidn_is_asked_for_its_weights(monkeypatch):
 def test_a_preset_that_ships_is_what_training_begins_with():
     model = _initial_model(INPUTS._replace(init="balanced"), FiveFrames(), seed=3)
     assert equal(weights(model), weights(load_model(shipped_weights("balanced"))))
+
+
+@pytest.mark.parametrize(
+    ("init", "asked", "used"),
+    [(None, None, "input"), ("fast", None, "start"), ("fast", "input", "input"), (None, "start", None)],
+)
+def test_losses_are_over_those_at_the_start_where_weights_are_given(init, asked, used, monkeypatch, tmp_path):
+    given = []
+    monkeypatch.setattr(module, "open_clips", lambda *args: FiveFrames())
+    monkeypatch.setattr(module, "split_by_shot", lambda clips, shots: (clips, clips))
+    monkeypatch.setattr(module, "train", lambda *args, **more: given.append(args[3].against))
+    inputs, config = INPUTS._replace(init=init), TrainConfig(steps=1, against=asked)
+
+    def train():
+        module.train_network(inputs, tmp_path / "w", config, threads=None, resume=False, log=print)
+
+    if used is None:
+        with pytest.raises(ValueError, match="against: expected input where training begins from nothing"):
+            train()
+    else:
+        train()
+        assert given == [used]
 
 
 def test_windows_of_another_length_are_asked_for_by_name():

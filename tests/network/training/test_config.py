@@ -9,7 +9,7 @@ from dataclasses import fields, replace
 import pytest
 
 from network.devices import DEVICES
-from network.training.config import LOSSES, TERMS, SamplerConfig, TrainConfig
+from network.training.config import AGAINST, LOSSES, TERMS, SamplerConfig, TrainConfig
 
 CONFIG = TrainConfig(steps=6)
 
@@ -24,6 +24,7 @@ CONFIG = TrainConfig(steps=6)
         ({"ema": 1.0}, "ema: expected 0 <= ema < 1"),
         ({"loss": "l3"}, "loss: expected one of"),
         ({"terms": "all"}, "terms: expected one of"),
+        ({"against": "me"}, "against: expected one of"),
         ({"device": "tpu"}, "device: expected one of"),
         ({"loss": "perceptual"}, "vgg: expected weights with the perceptual loss"),
         ({"slope": 0.5}, "slope: expected at least 1"),
@@ -50,7 +51,7 @@ def test_samplers_say_what_is_wrong(change: dict[str, float], message: str) -> N
 
 
 def test_every_choice_that_is_named_is_taken() -> None:
-    for name, choices in (("terms", TERMS), ("device", DEVICES)):
+    for name, choices in (("against", AGAINST), ("terms", TERMS), ("device", DEVICES)):
         for choice in choices:
             assert getattr(replace(CONFIG, **{name: choice}), name) == choice
     for loss in LOSSES:

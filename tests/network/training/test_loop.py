@@ -79,6 +79,7 @@ def sets(clips: Clips) -> tuple[Clips, Clips]:
 CONFIG = TrainConfig(
     steps=6, batch=2, rate=3e-3, warmup=3, ema=0.9, float32=True, device="cpu", sampler=SamplerConfig(crop=16, sets=1)
 )
+AGAINST_START = replace(CONFIG, against="start")
 
 
 def a_batch(clips: Clips, config: TrainConfig, count: int) -> Sample:
@@ -199,6 +200,36 @@ def test_losses_are_over_those_of_the_clips_best_input(clips: Clips, make: Calla
             batch_loss(model, batch._replace(error=factor * batch.error), CONFIG, losses.l1).item() for factor in (1, 2)
         )
     assert math.expm1(once) == pytest.approx(2 * math.expm1(half), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "expected"),
+    [
+        (0.4, 0.3, 0.0),  # a gain beyond 15 % counts nothing
+        (0.4, 0.4, 0.15**2),
+        (0.4, 0.5, 0.4**2),
+        (0.4, 0.8, 1.15 - 0.25),  # a line from 0.5 on
+        (0.001, 0.05, 0.15**2),  # an error at the start below 0.05 counts as that
+    ],
+)
+def test_losses_are_over_those_of_the_network_at_the_start(
+    clips: Clips, before: float, after: float, expected: float
+) -> None:
+    """The network at the start is the one that gets no gradients."""
+    batch = one_batch(clips)
+
+    def loss(prediction: torch.Tensor, *others: torch.Tensor | None) -> torch.Tensor:
+        return batch.error * (after if torch.is_grad_enabled() else before)
+
+    value = batch_loss(make_model(), batch, CONFIG, loss, start=make_model()).item()
+    assert value == pytest.approx(expected, rel=1e-4)
+
+
+def test_a_training_against_its_start_begins_at_the_loss_of_no_gain(sets: tuple[Clips, Clips], tmp_path: Path) -> None:
+    config = replace(AGAINST_START, steps=3)
+    values = train(sets[0], sets[0].of([]), make_robust(), config, tmp_path / "w.safetensors")
+    assert values[0] == pytest.approx(0.15**2, rel=1e-3)
+    assert values[2] != pytest.approx(0.15**2, rel=1e-3)  # the start stays as it was
 
 
 def test_the_perceptual_loss_is_vgg19s(
@@ -410,7 +441,7 @@ def _train_and_be_killed(rank: int, folder: str, out: str) -> None:
         if step == 5:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    train(*_sets_of(folder), make_model(), replace(CONFIG, validate_minutes=0.0), out, log=log)
+    train(*_sets_of(folder), make_model(), replace(AGAINST_START, validate_minutes=0.0), out, log=log)
 
 
 def _sets_of(folder: str | Path) -> tuple[Clips, Clips]:
@@ -424,7 +455,7 @@ def test_a_training_that_is_killed_is_resumed_as_if_nothing_had_happened(tmp_pat
         write_shards(tmp_path / "clips", f"shot{seed}", (4, 4), [make_clip(seed)])
     sets, out = _sets_of(tmp_path / "clips"), tmp_path / "w.safetensors"
     unbroken_model = make_model()
-    unbroken = train(*sets, unbroken_model, CONFIG, out)
+    unbroken = train(*sets, unbroken_model, AGAINST_START, out)
     assert not Path(f"{out}.state").exists()  # nothing to resume
     unbroken_average = load_model(out)
     out.unlink()
@@ -432,7 +463,7 @@ def test_a_training_that_is_killed_is_resumed_as_if_nothing_had_happened(tmp_pat
     with pytest.raises(torch.multiprocessing.ProcessExitedException, match="SIGKILL"):
         torch.multiprocessing.spawn(_train_and_be_killed, (str(tmp_path / "clips"), str(out)))
     model = make_model(seed=9)  # other weights: they must come from the file
-    assert train(*sets, model, CONFIG, out, resume=True) == unbroken[4:]
+    assert train(*sets, model, AGAINST_START, out, resume=True) == unbroken[4:]
     assert equal_weights(model, unbroken_model)
     assert equal_weights(load_model(out), unbroken_average)
     assert not Path(f"{out}.state").exists()
