@@ -32,8 +32,8 @@ SCHEDULES = {
     "balanced": ["--window", 5, "--steps", 3000],
     "quality": ["--window", 7, "--steps", 2000],
 }
-TRAIN = ["--init", "oidn", "--loss", "display", "--batch", 4, "--crop", 80, "--rate", 5e-5, "--backbone-rate", 1]
-TRAIN += ["--warmup", 50, "--ema", 0.995, "--sets", 1]
+TRAIN = ["--init", "oidn", "--loss", "display", "--differences", 0.5, "--batch", 2, "--crop", 80]
+TRAIN += ["--rate", 1.5e-5, "--backbone-rate", 1, "--warmup", 50, "--ema", 0.995, "--sets", 1]
 
 
 def main() -> int:
