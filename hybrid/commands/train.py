@@ -172,6 +172,8 @@ def train(
     with opt.usage():
         sampler = SamplerConfig(**opt.take(SamplerConfig, settings))
         config = TrainConfig(**settings, device=device, sampler=sampler)
+    if init is None and config.against == "start":
+        raise typer.BadParameter("--against is 'start', expected 'input' without --init, which gives the weights there")
     read = [("clip", path) for path in sorted(clips.glob("*.safetensors"))]
     given = {"init": init, "vgg": config.vgg}
     read += [(what, Path(path)) for what, path in given.items() if path and Path(path).is_file()]

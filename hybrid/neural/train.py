@@ -42,8 +42,6 @@ def train_network(
     """
     if threads is not None:
         limit_threads(threads)
-    if inputs.init is None and config.against == "start":
-        raise ValueError("against: expected input where training begins from nothing, got start; --init gives weights")
     config = replace(config, against=config.against or ("input" if inputs.init is None else "start"))
     training, validation = split_by_shot(open_clips(inputs.clips, inputs.window), inputs.validation)
     model = _initial_model(inputs, training, config.seed)

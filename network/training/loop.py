@@ -40,8 +40,8 @@ from network.windows import UNetWindow
 #: Share of the starting network's error from which on a crop counts, with `TrainConfig.against` "start": gains beyond
 #: 15 % of a crop would pay for losses in others.
 ENOUGH = 0.85
-#: Least error of the starting network in a crop, over that of the clip's best input: nothing is lost in a crop that is
-#: nearly right already.
+#: Least error of the starting network in a crop, over that of the clip's best input: ratios to smaller errors would
+#: outweigh all other crops.
 LEAST = 0.05
 
 
@@ -108,8 +108,8 @@ def batch_loss(
     the gradients of a hundred others.
     """
     if start is not None:
-        with torch.no_grad():
-            before = _crop_losses(start, batch, config, loss)
+        # Not without gradients, where networks take the fused operations of inference: both compute alike.
+        before = _crop_losses(start, batch, config, loss).detach()
         ratio = _crop_losses(model, batch, config, loss, run) / before.clamp_min(LEAST)
         return losses.bent_square(functional.relu(ratio - ENOUGH), 0.5).mean()
     return torch.log1p(_crop_losses(model, batch, config, loss, run)).mean()
@@ -205,7 +205,9 @@ def train(
     start = copy.deepcopy(average) if config.against == "start" else None
     groups = _groups(model, config.backbone_rate)
     optimizer = torch.optim.AdamW(groups, lr=config.rate, weight_decay=config.weight_decay)
-    saved: dict[str, Any] = {"model": model, "average": average, "start": start, "optimizer": optimizer}
+    saved: dict[str, Any] = {"model": model, "average": average, "optimizer": optimizer}
+    if start is not None:
+        saved["start"] = start
     # These settings may change between an interruption and its resumption.
     fixed = {name: value for name, value in asdict(config).items() if name not in ("validate_minutes", "workers")}
     identity = json.dumps({"model": describe(model), "training": fixed}, sort_keys=True)
@@ -215,9 +217,8 @@ def train(
     history: list[dict[str, float]] = []
     if resume:
         state = _read_state(state_path, identity)
-        for name, module in saved.items():
-            if module is not None:
-                module.load_state_dict(state[name])
+        for name, part in saved.items():
+            part.load_state_dict(state[name])
         progress = json.loads(state["progress"])
         step, before, history = progress["step"], progress["seconds"], progress["history"]
     loss_of_image = image_loss(config)
@@ -335,7 +336,7 @@ def _follow(average: nn.Module, model: nn.Module, decay: float) -> None:
 def _write_state(path: Path, identity: str, parts: dict[str, Any], progress: dict[str, Any]) -> None:
     """Everything the next step depends on, of modules and optimizer; replaces the last state whole."""
     partial = new_partial(path)
-    state = {name: part.state_dict() for name, part in parts.items() if part is not None}
+    state = {name: part.state_dict() for name, part in parts.items()}
     state |= {"identity": identity, "progress": json.dumps(progress)}
     torch.save(state, partial)
     os.replace(partial, path)

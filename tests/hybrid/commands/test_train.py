@@ -294,6 +294,12 @@ def test_every_option_arrives_where_it_belongs(asked):
     assert settings == {"threads": 2, "resume": True}
 
 
+def test_losses_over_those_at_the_start_need_weights_to_start_from(asked, capsys):
+    assert run("train", "clips", "-o", "w.safetensors", "--steps", 1, "--against", "start") == 2
+    assert "--against is 'start', expected 'input' without --init" in " ".join(capsys.readouterr().err.split())
+    assert not asked
+
+
 def test_the_former_name_of_an_option_still_works(asked):
     assert run("train", "clips", "-o", "w.safetensors", "--steps", 1, "--trunk-rate", 0.5) == 0
     (((_, _, config), _),) = asked
