@@ -6,7 +6,7 @@
 The shots are drawn from seeds (`ravg simulate random` and `hard`) and reproducible; no shot of the evaluation or of the
 tuning of ravg is among them. Each has a render of many samples. Its frames, denoised by `quality`, are the targets, and
 it is an input itself: networks trained without inputs of so many samples blurred textures (0.65 dB on one shot).
-Half of the shots are parts of large frames, where objects are smooth, half of small frames, full of detail.
+Shots are parts of large frames, where objects are smooth, and of small frames, full of detail.
 An interrupted run continues at the same shot, and trainings continue from their last checkpoint.
 docs/dev/experiments.md lists the gains.
 """
@@ -32,7 +32,7 @@ SHOTS = [
 ]
 RENDER = ["--frames", "1-7", "--size", "128x80", "--spp", "4-128", "--levels", "target=256,a=n,b=n/e"]
 CLIPS = "--reference --tile 0 --first-pass oidn-fast --window 7"
-#: Settings of each preset: the larger a network, the longer a step takes, and the smaller a batch its memory allows.
+#: Settings of each preset: the larger a network, the longer a step takes.
 SCHEDULES = {
     "fast": ["--window", 5, "--batch", 8, "--rate", 3e-5, "--steps", 5000],
     "balanced": ["--window", 5, "--batch", 8, "--rate", 3e-5, "--steps", 5000],
