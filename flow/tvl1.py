@@ -5,11 +5,12 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from flow.guide import GuidePair, pair_guides, smooth_tones
 from flow.selection import select_flow
 from flow.warp import interpolate, locate, weigh
+from loops.parallel import run_bands
 
 # Coupling of the data and the smoothness half of the energy (Zach's theta), and step of the dual ascent;
 # tau / theta = 0.25 / 0.3 is below the bound for convergence.
@@ -23,6 +24,9 @@ _BLUR = 0.8
 # Side, pixels, of refined tiles, and the rim solved around each: with this rim 99 of 100 vectors are within 0.04 px of
 # those of a whole frame, with half of it within 0.4. Beyond this share of tiles the rims cost more than is saved.
 _TILE, _RIM, _MOST_TILES = 128, 32, 0.5
+# Steps that a thread runs on its rows before it reads those of its neighbours again: as many rows around its own it
+# computes too.
+_STEPS = 10
 # `rough_flow` works on pictures of at most so many pixels.
 _ROUGH_PIXELS = 2**17
 
@@ -224,24 +228,33 @@ def _solve_block(
     height, width, channels = noise.shape
     change = np.ascontiguousarray(change.transpose(2, 0, 1))
     dual = np.zeros((4, height + 1, width + 1), np.float32)
+    next_change, next_dual = np.empty_like(change), np.zeros_like(dual)
     data = np.empty((5, channels, height, width), np.float32)
+    given = neighbour, centre, noise, base
     for _ in range(effort.warps):
-        _linearize(neighbour, centre, noise, base, change, corner, effort.attachment, data)
-        for _ in range(effort.iterations):
-            _step_primal(change, dual, data)
-            _step_dual(change, dual)
+        run_bands(_linearize, height, *given, change, corner, np.float32(effort.attachment), data)
+        for done in range(0, effort.iterations, _STEPS):
+            steps = min(_STEPS, effort.iterations - done)
+            run_bands(_iterate, height, change, dual, data, steps, next_change, next_dual)
+            change, next_change, dual, next_dual = next_change, change, next_dual, dual
         # Median: what total variation leaves of single wrong vectors (Wedel 2009, section 3.3).
         change = np.stack([cv2.medianBlur(component, 3) for component in change])
     return change.transpose(1, 2, 0)
 
 
-@njit(parallel=True, nogil=True, cache=True)
 def _with_gradients(planes: np.ndarray) -> np.ndarray:
     """Interleave (H, W, G) with its central differences in x and y, halved across the edge."""
     height, width, channels = planes.shape
-    half = np.float32(0.5)
     out = np.empty((height, width, 3 * channels), np.float32)
-    for y in prange(height):
+    run_bands(_add_gradients, height, planes, out)
+    return out
+
+
+@njit(nogil=True, cache=True)
+def _add_gradients(first: int, last: int, planes: np.ndarray, out: np.ndarray) -> None:
+    height, width, channels = planes.shape
+    half = np.float32(0.5)
+    for y in range(first, last):
         above, below = max(y - 1, 0), min(y + 1, height - 1)
         for x in range(width):
             left, right = max(x - 1, 0), min(x + 1, width - 1)
@@ -249,13 +262,12 @@ def _with_gradients(planes: np.ndarray) -> np.ndarray:
                 out[y, x, 3 * g] = planes[y, x, g]
                 out[y, x, 3 * g + 1] = half * (planes[y, right, g] - planes[y, left, g])
                 out[y, x, 3 * g + 2] = half * (planes[below, x, g] - planes[above, x, g])
-    return out
 
 
-@njit(parallel=True, nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _linearize(
-    neighbour: np.ndarray, centre: np.ndarray, noise: np.ndarray, base: np.ndarray, change: np.ndarray,
-    corner: tuple[int, int], attachment: float, data: np.ndarray,
+    first: int, last: int, neighbour: np.ndarray, centre: np.ndarray, noise: np.ndarray, base: np.ndarray,
+    change: np.ndarray, corner: tuple[int, int], attachment: np.float32, data: np.ndarray,
 ) -> None:  # fmt: skip
     """Expand the difference of the guides to first order about base + change.
 
@@ -263,10 +275,10 @@ def _linearize(
     difference without a change, its slope in x and in y, one over the square of the slope, and the bound of a step, in
     slopes.
     """
-    height, width, channels = noise.shape
+    _, width, channels = noise.shape
     frame_height, frame_width = neighbour.shape[:2]
     half, one = np.float32(0.5), np.float32(1)
-    for y in prange(height):
+    for y in range(first, last):
         for x in range(width):
             u, v = change[0, y, x], change[1, y, x]
             px, py = np.float32(corner[1] + x) + base[y, x, 0] + u, np.float32(corner[0] + y) + base[y, x, 1] + v
@@ -286,42 +298,56 @@ def _linearize(
                 data[1, g, y, x], data[2, g, y, x] = ax, ay
                 # 1e-9: a slope of 3e-5 of the guide's range per pixel, below what 8 bits could tell from flat.
                 data[3, g, y, x] = one / (square + np.float32(1e-9))
-                data[4, g, y, x] = _THETA * np.float32(attachment) * trust if place.inside else np.float32(0)
+                data[4, g, y, x] = _THETA * attachment * trust if place.inside else np.float32(0)
 
 
-@njit(parallel=True, nogil=True, cache=True)
-def _step_primal(change: np.ndarray, dual: np.ndarray, data: np.ndarray) -> None:
-    """Move each vector towards its match, then towards its neighbours."""
+def _iterate(
+    first: int, last: int, change: np.ndarray, dual: np.ndarray, data: np.ndarray, steps: int, next_change: np.ndarray,
+    next_dual: np.ndarray,
+) -> None:  # fmt: skip
+    """Run some steps on rows, from `change` and `dual` to the next ones.
+
+    A step reads one row beyond each side, so that as many more rows as there are steps make the result exact.
+    """
+    top, bottom = max(first - steps, 0), min(last + steps, change.shape[1])
+    own_change, own_dual = change[:, top:bottom].copy(), dual[:, top : bottom + 1].copy()
+    _step(own_change, own_dual, data, top, steps)
+    next_change[:, first:last] = own_change[:, first - top : last - top]
+    # Row y + 1 of the dual belongs to row y; the first is a border of zeros.
+    next_dual[:, first + 1 : last + 1] = own_dual[:, first - top + 1 : last - top + 1]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _step(change: np.ndarray, dual: np.ndarray, data: np.ndarray, top: int, steps: int) -> None:
+    """Move each vector towards its match, then towards its neighbours, some times; the rows of `data` begin at `top`.
+
+    The dual follows the gradient of the flow; its first row and column are a border of zeros.
+    """
     u, v = change[0], change[1]
-    rho, gx, gy, inverse_square, bound = data[0], data[1], data[2], data[3], data[4]
-    channels, height, width = rho.shape
-    for y in prange(height):
-        for g in range(channels):
-            for x in range(width):
-                residual = (rho[g, y, x] + gx[g, y, x] * u[y, x] + gy[g, y, x] * v[y, x]) * inverse_square[g, y, x]
-                residual = min(max(residual, -bound[g, y, x]), bound[g, y, x])
-                u[y, x] -= residual * gx[g, y, x]
-                v[y, x] -= residual * gy[g, y, x]
-        for x in range(width):
-            u[y, x] += _THETA * (dual[0, y + 1, x + 1] - dual[0, y + 1, x] + dual[1, y + 1, x + 1] - dual[1, y, x + 1])
-            v[y, x] += _THETA * (dual[2, y + 1, x + 1] - dual[2, y + 1, x] + dual[3, y + 1, x + 1] - dual[3, y, x + 1])
-
-
-@njit(parallel=True, nogil=True, cache=True)
-def _step_dual(change: np.ndarray, dual: np.ndarray) -> None:
-    """Follow the gradient of the flow; the dual's first row and column are a border of zeros."""
-    _, height, width = change.shape
+    height, width = u.shape
     one = np.float32(1)
-    for y in prange(height):
-        below = min(y + 1, height - 1)
-        for k in range(2):
-            f = change[k]
-            for x in range(width - 1):
-                dx, dy = f[y, x + 1] - f[y, x], f[below, x] - f[y, x]
-                scale = one / (one + _DUAL_STEP * np.sqrt(dx * dx + dy * dy))
-                dual[2 * k, y + 1, x + 1] = (dual[2 * k, y + 1, x + 1] + _DUAL_STEP * dx) * scale
-                dual[2 * k + 1, y + 1, x + 1] = (dual[2 * k + 1, y + 1, x + 1] + _DUAL_STEP * dy) * scale
-            dy = f[below, width - 1] - f[y, width - 1]
-            dual[2 * k + 1, y + 1, width] = (dual[2 * k + 1, y + 1, width] + _DUAL_STEP * dy) / (
-                one + _DUAL_STEP * abs(dy)
-            )
+    for _ in range(steps):
+        for y in range(height):
+            for g in range(data.shape[1]):
+                rho, gx, gy = data[0, g, top + y], data[1, g, top + y], data[2, g, top + y]
+                inverse_square, bound = data[3, g, top + y], data[4, g, top + y]
+                for x in range(width):
+                    residual = (rho[x] + gx[x] * u[y, x] + gy[x] * v[y, x]) * inverse_square[x]
+                    residual = min(max(residual, -bound[x]), bound[x])
+                    u[y, x] -= residual * gx[x]
+                    v[y, x] -= residual * gy[x]
+            for k in range(2):
+                f, across, down = change[k, y], dual[2 * k, y + 1], dual[2 * k + 1]
+                for x in range(width):
+                    f[x] += _THETA * (across[x + 1] - across[x] + down[y + 1, x + 1] - down[y, x + 1])
+        for y in range(height):
+            for k in range(2):
+                f, below = change[k, y], change[k, min(y + 1, height - 1)]
+                across, down = dual[2 * k, y + 1], dual[2 * k + 1, y + 1]
+                for x in range(width - 1):
+                    dx, dy = f[x + 1] - f[x], below[x] - f[x]
+                    scale = one / (one + _DUAL_STEP * np.sqrt(dx * dx + dy * dy))
+                    across[x + 1] = (across[x + 1] + _DUAL_STEP * dx) * scale
+                    down[x + 1] = (down[x + 1] + _DUAL_STEP * dy) * scale
+                dy = below[width - 1] - f[width - 1]
+                down[width] = (down[width] + _DUAL_STEP * dy) / (one + _DUAL_STEP * abs(dy))

@@ -1,7 +1,8 @@
 """Run a compiled loop on all cores: a plain loop, compiled once, which threads run on bands of rows.
 
 numba's own ``parallel=True`` makes loops no faster, and takes three to six times as long to compile: each ``prange``
-becomes a function of its own, which passes the whole compiler again.
+becomes a function of its own, which passes the whole compiler again. Its threads, of OpenMP, wait for each other
+without sleeping: beside a renderer that keeps two cores busy TV-L1 took 4.4 s in place of 0.04.
 """
 
 import os

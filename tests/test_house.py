@@ -130,20 +130,17 @@ def test_a_modules_tests_are_where_anyone_would_look(package):
 def test_compiled_loops_leave_the_order_of_arithmetic_alone():
     """With fastmath a process that had compiled a loop gave other last digits than one that found it in the cache.
 
-    Loops that numba makes parallel take four times as long to compile; each of those left runs many times a frame, or
-    in training.
+    Loops that numba makes parallel take four times as long to compile, and a hundred times as long to run where another
+    process keeps all cores busy: at the end of each, threads wait for each other without sleeping.
     """
-    loops, parallel = 0, set[str]()
+    loops = 0
     for path in (path for package in ("flow", "nlm", "network") for path in (ROOT / package).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "njit":
                 loops += 1
                 options = {keyword.arg for keyword in node.keywords}
-                assert "fastmath" not in options, f"{path.name}:{node.lineno}"
-                if "parallel" in options:
-                    parallel.add(path.name)
+                assert not options & {"fastmath", "parallel"}, f"{path.name}:{node.lineno}"
     assert loops > 10
-    assert parallel == {"tvl1.py", "kernels.py"}
 
 
 def defines(dotted: str) -> bool:

@@ -13,11 +13,13 @@ from itertools import product
 from typing import Any, NamedTuple, Self
 
 import torch
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
+
+from loops.parallel import run_bands
 
 _PROCESSOR = "cpu"  # where compiled loops run; elsewhere torch's own operations
 
@@ -227,7 +229,8 @@ class _ApplyKernels(torch.autograd.Function):
         kernels = kernels.unflatten(1, (-1, size * size)).contiguous()
         sums = padded.new_zeros(*padded.shape[:3], *kernels.shape[3:])
         if padded.device.type == _PROCESSOR:
-            _add_taps(_planes(kernels), _planes(padded), _planes(sums), tuple(range(size)))
+            rows = sums.shape[0] * sums.shape[1] * sums.shape[3]
+            run_bands(_add_taps, rows, _planes(kernels), _planes(padded), _planes(sums), tuple(range(size)))
         else:
             for tap, window in _windows(padded, size):
                 sums.addcmul_(kernels[:, :, tap, None], window)
@@ -243,10 +246,11 @@ class _ApplyKernels(torch.autograd.Function):
         to_padded = torch.zeros_like(padded) if ctx.needs_input_grad[1] else None
         to_sums = to_sums.contiguous()
         if padded.device.type == _PROCESSOR:
+            frames, height = to_sums.shape[0] * to_sums.shape[1], to_sums.shape[3]
             if to_kernels is not None:
-                _to_taps(_planes(to_sums), _planes(padded), _planes(to_kernels), ctx.size)
+                run_bands(_to_taps, frames * height, _planes(to_sums), _planes(padded), _planes(to_kernels), ctx.size)
             if to_padded is not None:
-                _to_frames(_planes(to_sums), _planes(kernels), _planes(to_padded), ctx.size)
+                run_bands(_to_frames, frames, _planes(to_sums), _planes(kernels), _planes(to_padded), ctx.size)
         else:
             for tap, window in _windows(padded, ctx.size):
                 if to_kernels is not None:
@@ -270,13 +274,13 @@ def _planes(tensor: Tensor) -> NDArray[Any]:
     return planes
 
 
-@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def _add_taps(
-    kernels: NDArray[Any], padded: NDArray[Any], sums: NDArray[Any], columns: tuple[int, ...]
+    first: int, last: int, kernels: NDArray[Any], padded: NDArray[Any], sums: NDArray[Any], columns: tuple[int, ...]
 ) -> None:  # pragma: no cover - compiled
     """Add the taps' products to the sums. The number of columns is known to the compiler, which unrolls them."""
-    size, (count, channels, height, width) = len(columns), sums.shape
-    for job in prange(count * height):
+    size, (_, channels, height, width) = len(columns), sums.shape
+    for job in range(first, last):
         frame, y = job // height, job % height
         for row in range(size):
             for channel in range(channels):
@@ -288,13 +292,13 @@ def _add_taps(
                     sums[frame, channel, y, x] = total
 
 
-@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def _to_taps(
-    to_sums: NDArray[Any], padded: NDArray[Any], to_kernels: NDArray[Any], size: int
+    first: int, last: int, to_sums: NDArray[Any], padded: NDArray[Any], to_kernels: NDArray[Any], size: int
 ) -> None:  # pragma: no cover - compiled
     """Gradient of the kernels."""
-    count, channels, height, width = to_sums.shape
-    for job in prange(count * height):
+    _, channels, height, width = to_sums.shape
+    for job in range(first, last):
         frame, y = job // height, job % height
         for tap in range(size * size):
             row, column = tap // size, tap % size
@@ -308,13 +312,13 @@ def _to_taps(
                     gradient[x] += given[x] * read[x]
 
 
-@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def _to_frames(
-    to_sums: NDArray[Any], kernels: NDArray[Any], to_padded: NDArray[Any], size: int
+    first: int, last: int, to_sums: NDArray[Any], kernels: NDArray[Any], to_padded: NDArray[Any], size: int
 ) -> None:  # pragma: no cover - compiled
     """Gradient of the frames, scattered to where the taps have read; frame by frame, as rows overlap."""
-    count, channels, height, width = to_sums.shape
-    for frame in prange(count):
+    _, channels, height, width = to_sums.shape
+    for frame in range(first, last):
         for y in range(height):
             for tap in range(size * size):
                 row, column = tap // size, tap % size

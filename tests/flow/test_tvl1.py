@@ -11,6 +11,7 @@ from flow.guide import Guide, estimate_noise, pair_guides
 from flow.selection import select_flow
 from flow.tvl1 import dense_flow, refine_flow
 from flow.warp import warp
+from loops import parallel
 from tests.flow.scenes import HEIGHT, WIDTH, Shot, error, moved, perturbation, plain, texture
 
 
@@ -137,6 +138,18 @@ def test_noise_alone_does_not_move_vectors() -> None:
     selected, choice = select_flow([still, refined], guides)
     assert choice.mean() < 0.02
     assert np.abs(selected).mean() < 0.01
+
+
+@pytest.mark.parametrize("threads", [2, 5, 16])
+def test_the_flow_does_not_depend_on_the_number_of_threads(
+    shot: Shot, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = shot.flow + perturbation(np.random.default_rng(1), 2)
+    flows = []
+    for count in (1, threads):
+        monkeypatch.setattr(parallel, "get_num_threads", lambda count=count: count)
+        flows.append(refine_flow(shot.guides, start, iterations=23))
+    np.testing.assert_array_equal(*flows)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (5, 5), (17, 33), (16, 16), (35, 31)])
