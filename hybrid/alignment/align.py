@@ -1,7 +1,7 @@
 """Align a window of frames to its centre (`align`, for all filters and networks), and results to each other."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from hybrid.files.layers import Layers
 from hybrid.runtime.timing import Timings
 from nlm.average import average, reject_outliers
 from nlm.drift import drift_weights, pull_to_centre
-from nlm.gate import agreement_weight, color_gate, color_gates
+from nlm.gate import SHARE, agreement_weight, color_gate, color_gates
 from nlm.pooling import SampleRange
 from nlm.relight import relight
 from nlm.samples import average_neighbours
@@ -28,6 +28,10 @@ FINISHED = 0.1, 0.5
 # The same without noise, in tone-mapped units, and by how many times more single pixels may differ: without the second
 # a shot of sharp outlines loses 1 dB at 128 and 512 samples, half of it with 3; 1 costs still shots up to 8 dB in time.
 FINISHED_FLOOR, FINISHED_DETAIL = 0.001, 2.0
+# The gate's tolerance, a share of the noise, where light drifts, and the weights by drift of the next frame
+# (`nlm.drift`) below which it counts alone and above which not at all. Averages with half-trusted frames of a moving
+# shadow are worse than the centre alone: one such shot of 8 samples gains 0.2 / 0.3 dB, ten others change by 0.01.
+DRIFTING_SHARE, DRIFTING = 0.1, (0.6, 0.85)
 # How much more finished pictures lose by a drift than first passes do, whose errors are several times as large: 20 and
 # 100 differ by 0.05 dB, and by 0.25 dB where shadows move.
 DRIFTED = 100
@@ -111,17 +115,25 @@ def align(
         if estimates is not None:
             # By the centre's albedo and not by each frame's own, which may be noisy as the first pass is not.
             estimates /= modulation
-            confidence = trust_light(confidence, coverage, color_gate(estimates, own, bright.exposure), stages)
-            del coverage  # windows are large
+            shares = (SHARE, DRIFTING_SHARE) if "drift" in stages else (SHARE,)
+            gates = color_gates(estimates, own, bright.exposure, shares)
+            confidence, *strict = (trust_light(confidence, coverage, gate, stages) for gate in gates)
+            del coverage, gates  # windows are large
             if "gate" in stages:
                 agreement = agreement_weight(estimates, own, confidence, bright.exposure)
-                for neighbours in (confidence[:middle], confidence[middle + 1 :]):
-                    neighbours *= agreement
+                for trusted in (confidence, *strict):
+                    trusted[:middle] *= agreement
+                    trusted[middle + 1 :] *= agreement
         elif "gate" in stages:
             confidence = confidence * color_gate(warped.layers["light"], own, bright.exposure)
         weight = sides = found = residuals = None
         if estimates is not None and "drift" in stages:
             weight = drift_weights(estimates, own, confidence, bright.exposure, first_row=padded.start)
+            (drifting,) = strict
+            drifting -= confidence
+            drifting *= 1 - smooth_step(weight[min(middle + 1, len(weight) - 1)], *DRIFTING)
+            confidence += drifting
+            del drifting, strict
         if "blend-samples" in stages:
             if estimates is not None:
                 found = SampleRange.empty(own.shape) if ranged else None
@@ -224,8 +236,13 @@ def measure_stillness(drift_weight: Array | None, shape: tuple[int, int]) -> Sti
     still += np.float32(1 - DRIFTED)
     np.reciprocal(still, out=still)
     least, enough = STANDING
-    t = min(max((float(still.mean()) - least) / (enough - least), 0.0), 1.0)
-    return Stillness(still, np.float32(t * t * (3 - 2 * t)))
+    return Stillness(still, smooth_step(still.mean(), least, enough))
+
+
+def smooth_step(x: Any, least: float, enough: float) -> Any:
+    """Rise from 0 at `least` to 1 at `enough`, as 3 t² − 2 t³, in float32."""
+    t = np.clip((x - np.float32(least)) / np.float32(enough - least), 0, 1)
+    return t * t * (3 - 2 * t)
 
 
 def expect_equal_layers(frames: Sequence[PreparedFrame | None]) -> None:

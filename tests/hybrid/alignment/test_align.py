@@ -87,6 +87,33 @@ def test_detail_that_all_neighbours_lack_takes_their_confidence(tmp_path):
     assert aligned.confidence[2].min() == 1
 
 
+def test_where_light_drifts_neighbours_count_less(tmp_path):
+    """By less than the noise: the gate passes it, and averages of half-trusted frames are worse than the centre."""
+    scene = replace(SCENE, height=96, width=192, step=(0, 0), noise=0.3)
+
+    def brighter(light, index):
+        light = light.copy()
+        light[:, 96:] *= np.float32(1 + 0.04 * index)
+        return light
+
+    def brighten(index, layers):
+        layers["ViewLayer.Combined"] = brighter(layers["ViewLayer.Combined"], index)
+
+    def estimate(frame):
+        errors = np.random.default_rng(frame.number).normal(1, 0.01, frame.color.shape).astype(np.float32)
+        return brighter(scene.clean(0)["ViewLayer.Combined"], frame.number - scene.first) * errors
+
+    shot = open_shot(scene.write(tmp_path, edit=brighten))
+    plain, drifting = (
+        FrameStream(shot, only({"warp", "gate", *more}), first_pass=PerFrame(estimate)).align(MIDDLE).confidence
+        for more in ((), ("drift",))
+    )
+    assert plain[0, :, 128:].mean() > 0.4
+    assert drifting[0, :, 128:].mean() < 0.5 * plain[0, :, 128:].mean()
+    assert drifting[0, :, :64].mean() > 0.9 * plain[0, :, :64].mean()
+    assert drifting[2].min() == 1
+
+
 @pytest.mark.parametrize("stages", [{"blend-samples"}, {"blend-samples", "drift"}, {"drift"}])
 def test_the_range_of_the_samples_is_found_while_they_are_averaged(stages, tmp_path):
     """By the first pass as it is afterwards, pulled to the centre's."""
