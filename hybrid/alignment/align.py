@@ -28,9 +28,9 @@ FINISHED = 0.1, 0.5
 # The same without noise, in tone-mapped units, and by how many times more single pixels may differ: without the second
 # a shot of sharp outlines loses 1 dB at 128 and 512 samples, half of it with 3; 1 costs still shots up to 8 dB in time.
 FINISHED_FLOOR, FINISHED_DETAIL = 0.001, 2.0
-# The gate's tolerance, a share of the noise, where light drifts, and the weights by drift of the next frame
-# (`nlm.drift`) below which it counts alone and above which not at all. Averages with half-trusted frames of a moving
-# shadow are worse than the centre alone: one such shot of 8 samples gains 0.2 / 0.3 dB, ten others change by 0.01.
+# The gate's tolerance for estimates, a share of the noise, where light drifts, and the weights by drift of the next
+# frame (`nlm.drift`) below which it counts alone and above which not at all. Averages with half-trusted frames of a
+# moving shadow are worse than the centre alone: one such shot of 8 samples gains 0.2 / 0.3 dB, others change by 0.01.
 DRIFTING_SHARE, DRIFTING = 0.1, (0.6, 0.85)
 # How much more finished pictures lose by a drift than first passes do, whose errors are several times as large: 20 and
 # 100 differ by 0.05 dB, and by 0.25 dB where shadows move.
@@ -126,24 +126,20 @@ def align(
                     trusted[middle + 1 :] *= agreement
         elif "gate" in stages:
             confidence = confidence * color_gate(warped.layers["light"], own, bright.exposure)
-        weight = sides = found = residuals = None
+        weight = pull = sides = found = residuals = None
         if estimates is not None and "drift" in stages:
             weight = drift_weights(estimates, own, confidence, bright.exposure, first_row=padded.start)
-            (drifting,) = strict
-            drifting -= confidence
-            drifting *= 1 - smooth_step(weight[min(middle + 1, len(weight) - 1)], *DRIFTING)
-            confidence += drifting
-            del drifting, strict
+            pull = _stricter_where_light_drifts(weight, confidence, strict.pop())
         if "blend-samples" in stages:
             if estimates is not None:
                 found = SampleRange.empty(own.shape) if ranged else None
-                residuals = _pull_behind(sources.residual_strips(), estimates, confidence, weight, found)
+                residuals = _pull_behind(sources.residual_strips(), estimates, confidence, pull, found)
             pictures = color if estimates is None else estimates
             assert pictures is not None
             noisy = centre.radiance[padded]
             sides = average_neighbours(pictures, residuals, confidence, warped.confidence, modulation, noisy)
-        elif estimates is not None and weight is not None:
-            pull_to_centre(estimates, confidence, weight)
+        elif estimates is not None and pull is not None:
+            pull_to_centre(estimates, confidence, pull)
     return AlignedWindow(
         number=centre.number,
         centre_irradiance=own,
@@ -325,6 +321,17 @@ def _warp_first_pass(
                 warped[index] = there[rows]
             fill_uncovered(warped[index], middle[rows], coverage[index])
     return warped
+
+
+def _stricter_where_light_drifts(weight: Array, confidence: Array, strict: Array) -> Array:
+    """Multiply weights by drift by how much less a strict gate trusts a frame, where light drifts; reuses `strict`."""
+    drifting = 1 - smooth_step(weight[min(len(weight) // 2 + 1, len(weight) - 1)], *DRIFTING)
+    np.divide(strict, confidence, out=strict, where=confidence > 0)  # at most 1, and any where both are 0
+    strict -= 1
+    strict *= drifting
+    strict += 1
+    strict *= weight
+    return strict
 
 
 def _pull_behind(
