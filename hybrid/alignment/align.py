@@ -232,10 +232,10 @@ def measure_stillness(drift_weight: Array | None, shape: tuple[int, int]) -> Sti
     still += np.float32(1 - DRIFTED)
     np.reciprocal(still, out=still)
     least, enough = STANDING
-    return Stillness(still, smooth_step(still.mean(), least, enough))
+    return Stillness(still, _smooth_step(still.mean(), least, enough))
 
 
-def smooth_step(x: Any, least: float, enough: float) -> Any:
+def _smooth_step(x: Any, least: float, enough: float) -> Any:
     """Rise from 0 at `least` to 1 at `enough`, as 3 t² − 2 t³, in float32."""
     t = np.clip((x - np.float32(least)) / np.float32(enough - least), 0, 1)
     return t * t * (3 - 2 * t)
@@ -325,7 +325,7 @@ def _warp_first_pass(
 
 def _stricter_where_light_drifts(weight: Array, confidence: Array, strict: Array) -> Array:
     """Multiply weights by drift by how much less a strict gate trusts a frame, where light drifts; reuses `strict`."""
-    drifting = 1 - smooth_step(weight[min(len(weight) // 2 + 1, len(weight) - 1)], *DRIFTING)
+    drifting = 1 - _smooth_step(weight[min(len(weight) // 2 + 1, len(weight) - 1)], *DRIFTING)
     np.divide(strict, confidence, out=strict, where=confidence > 0)  # at most 1, and any where both are 0
     strict -= 1
     strict *= drifting
