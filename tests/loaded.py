@@ -3,18 +3,14 @@
 import contextlib
 import os
 import tempfile
-import threading
 from pathlib import Path
 
 import cv2
-from numba.np.ufunc import parallel
 
 from tests.commands import import_all
 from tests.scenes import Scene
 
 cv2.setNumThreads(1)
-# numba's lock is shared with forked processes: one that is killed while it holds it would block all that come later.
-parallel._backend_init_process_lock = threading.RLock()
 import_all()
 with contextlib.suppress(ImportError):
     import torch

@@ -1,4 +1,4 @@
-"""Thread counts of numba, torch, OpenCV and OIDN, which have pools of their own, and their waiting policy."""
+"""Thread counts of compiled loops, torch, OpenCV and OIDN, which have pools of their own, and their waiting policy."""
 
 import os
 import sys
@@ -8,7 +8,7 @@ CACHE_LOCATORS = "UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocat
 SPINS = 3000  # spins of a waiting thread of GNU's OpenMP before it sleeps: 1,000 and 10,000 are nearly as good
 
 
-MOST_THREADS = 1024  # numba ends with a segmentation fault if it is to start a hundred thousand
+MOST_THREADS = 1024  # more is a mistake: numba ends with a segmentation fault if it starts a hundred thousand
 
 
 def check_thread_counts() -> None:
@@ -50,13 +50,14 @@ def prepare_libraries() -> None:
 
 
 def limit_threads(count: int) -> None:
-    """Limit numba (to what it was started with), OpenCV and torch to `count` threads; OIDN is limited at each call."""
+    """Limit compiled loops, OpenCV and torch to `count` threads; OIDN is limited at each call."""
     import cv2
-    import numba
 
-    # If torch is imported later, it takes MKL's number; without one it would take the number numba set for OpenMP.
+    from loops.parallel import limit_loops
+
+    # If torch is imported later, it takes MKL's number.
     os.environ["OMP_NUM_THREADS"] = os.environ["MKL_NUM_THREADS"] = str(count)
     cv2.setNumThreads(count)
-    numba.set_num_threads(min(count, numba.get_num_threads()))
+    limit_loops(count)
     if (torch := sys.modules.get("torch")) is not None:
         torch.set_num_threads(count)

@@ -147,7 +147,7 @@ def test_the_flow_does_not_depend_on_the_number_of_threads(
     start = shot.flow + perturbation(np.random.default_rng(1), 2)
     flows = []
     for count in (1, threads):
-        monkeypatch.setattr(parallel, "get_num_threads", lambda count=count: count)
+        monkeypatch.setattr(parallel, "thread_count", lambda count=count: count)
         flows.append(refine_flow(shot.guides, start, iterations=23))
     np.testing.assert_array_equal(*flows)
 
