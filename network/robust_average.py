@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from network.cpu.fused_ops import blend_channels, can_blend
+from network.cpu.training_ops import BlendChannels
 
 
 def ravg(frames: Sequence[Tensor]) -> Tensor:
@@ -121,15 +122,20 @@ class ChannelAverage(nn.Module):
         With `common` ``(N, C, H, W)`` that is added to each frame returned, and a ReLU follows.
         """
         weight, order = torch.sigmoid(self.blend), outermost_first(frames)
-        if not torch.is_grad_enabled() and can_blend(x, frames):
-            return blend_channels(x, frames, order, weight, [frames // 2] if centre else range(frames), common)
+        if can_blend(x, frames):
+            returned = [frames // 2] if centre else list(range(frames))
+            if not torch.is_grad_enabled():
+                return blend_channels(x, frames, order, weight, returned, common)
+            if x.dtype == weight.dtype == torch.float32:
+                blended: Tensor = BlendChannels.apply(x, frames, order, weight, returned, common)  # type: ignore[no-untyped-call]
+                return blended
         state, weight = list(x.chunk(frames)), weight.to(x.dtype)[:, None, None]
         for i in order if frames > 1 else ():
             state[i] = torch.lerp(state[i], ravg(state[:i] + state[i + 1 :]), weight)
-        returned = [state[frames // 2]] if centre else state
+        images = [state[frames // 2]] if centre else state
         if common is not None:
-            returned = [torch.relu(image + common) for image in returned]
-        return torch.cat(returned)
+            images = [torch.relu(image + common) for image in images]
+        return torch.cat(images)
 
 
 def outermost_first(frames: int) -> list[int]:

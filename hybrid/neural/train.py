@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import torch
 
+from hybrid.runtime.allocator import reuse_freed_memory
 from hybrid.runtime.threads import limit_threads
 from network.checkpoint import load_model, shipped_weights
 from network.presets import PRESETS, Model, build_preset
@@ -42,6 +43,7 @@ def train_network(
     """
     if threads is not None:
         limit_threads(threads)
+    reuse_freed_memory()
     config = replace(config, against=config.against or ("input" if inputs.init is None else "start"))
     training, validation = split_by_shot(open_clips(inputs.clips, inputs.window), inputs.validation)
     model = _initial_model(inputs, training, config.seed)
