@@ -75,7 +75,7 @@ def enlarge_shot(folder: Path, frames: int, scale: int = REPEAT, *, busy: bool =
 
 
 def _to_and_fro(count: int, frames: int) -> list[tuple[int, int, int]]:
-    """Of each frame which file is shown, and which before and after it."""
+    """The file that each frame shows, and those that the frames before and after it show."""
     order = [*range(count), *range(count - 2, 0, -1)]
     shown = [order[number % len(order)] for number in range(-1, frames + 1)]
     return list(zip(shown[1:-1], shown[:-2], shown[2:], strict=True))

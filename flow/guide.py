@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 _REC709 = np.array([0.2126, 0.7152, 0.0722], np.float32)
-# Of the guided filter that the luminance goes through, pixels.
+# Radius of the guided filter of the luminance, pixels.
 _RADIUS = 2
 # Rows whose luminance is made at a time.
 _STRIP = 128

@@ -249,7 +249,7 @@ def invert_flow(
     """Invert the flow (H, W, 2), finite, from frame b to frame a by splatting: flow and validity from a to b.
 
     Where a renderer gives only vectors to the previous frame, those to the next frame are `invert_flow(the next frame's
-    to_previous)`. Vectors of b that are not `valid` (H, W) are left out. Of several pixels that arrive at one place the
+    to_previous)`. Vectors of b that are not `valid` (H, W) are left out. Among pixels that arrive at one place the
     nearest by `depth` (H, W), above 0, wins, without depth the fastest, as fast objects tend to be in front. Where
     nothing arrives (hidden in b) the inverse is invalid, the mean of the neighbours within two pixels, else 0.
     """

@@ -1,4 +1,4 @@
-"""What the user touches: EXR files, shots, the plan, the pipeline, comparison, the command.
+"""The part that users touch: EXR files, shots, the plan, the pipeline, comparison, the command.
 
 For other programs: `open_shot` finds the frames of a shot, `denoise_shot` denoises and writes them as the command does,
 and `DenoiseOptions` describes how; `denoise_arrays` denoises arrays without files. They are imported when they are

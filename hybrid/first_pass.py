@@ -317,7 +317,7 @@ def _checked(found: Array | None, frame: Frame, highlights: Highlights | None = 
         raise ValueError(f"{what} has shape {found.shape}, expected {frame.color.shape}")
     filled, lost = replace_nonfinite(found)
     noisy, bad = replace_nonfinite(frame.color)
-    # What the renderer has lost as well counts for nothing.
+    # Pixels that the renderer has lost as well do not count.
     if (count := np.count_nonzero(lost & ~bad)) > LOST * lost.size:
         raise ValueError(f"{what}: {count} of {lost.size} pixels are not finite, where the frame is")
     filled = np.maximum(filled, 0)

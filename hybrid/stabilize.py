@@ -139,7 +139,7 @@ class FrameDenoiser:
     def make(self, number: int) -> FrameResult:
         """Denoise a frame; ValueError or OSError if it, or a neighbour, fails, or its light is not the samples'."""
         averaged = self.neighbours(number)
-        # Of the frame before only what the average reads is left.
+        # The frame before keeps only what the average reads.
         self._results = {n: _needed(result, n >= number) for n, result in self._results.items() if n in averaged}
         for n in averaged:
             if n not in self._results or (n == number and not self._results[n].trust):
@@ -272,7 +272,7 @@ class FrameDenoiser:
         counted = frame.valid if moving is None else frame.valid & ~moving[0]
         if "restore-mean" in result.plan.stages:
             with timings.stage("restore-mean"):
-                # What is wrong beside a lamp stays there: spread over a room, a halo of 60 pixels darkened it by 1 %.
+                # An error beside a lamp stays there: spread over a room, a halo of 60 pixels darkened it by 1 %.
                 far = counted & ~beside_lamps(color, exposure)
                 # First without fireflies: a mean of few bright samples is not known, that of all others is.
                 for noisy in (radiance, rendered) if frame.removed_samples else (rendered,):

@@ -194,7 +194,7 @@ def replace_fireflies(color: Floats, places: Places) -> tuple[Floats, Mask, floa
     """Replace fireflies by the mean of the ring around them, which leaves neither a dark hole nor a halo.
 
     Returns a copy, where (H, W) it was replaced, and the removed share of the frame's light, in [0, 1]; in expectation
-    this light belongs to the picture. Of the 3×3 around a place those pixels are replaced that are above four times the
+    this light belongs to the picture. Pixels in the 3×3 around a place are replaced if they are above four times the
     brightest of the ring.
     """
     cleaned, replaced = color.copy(), np.zeros(color.shape[:2], bool)
@@ -316,7 +316,7 @@ def _find(
                 for i in range(max(x - 2, 0), min(x + 3, width)):
                     near = level[j, i]
                     if abs(j - y) <= 1 and abs(i - x) <= 1:
-                        # Of equal pixels the first counts.
+                        # The first of equal pixels counts.
                         if near > value or (near == value and (j, i) < (y, x)):
                             peak = False
                     else:

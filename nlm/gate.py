@@ -127,7 +127,7 @@ def agreement_weight(estimates: Floats, noisy: Floats, confidence: Floats, expos
 
         V = B₂₁[Σ c (d − A)²] / B₂₁[Σ c − Σ c² / Σ c],    E = B₁₁[Σ c · A²] / B₁₁[Σ c],
 
-    V is the variance of an estimate's error, and E should be V (1 + 1 / N). What exceeds that and the noise s² of the
+    V is the variance of an estimate's error, and E should be V (1 + 1 / N). The part above that and the noise s² of the
     samples (B₁₅ of noisy − centre, squared), which the error of an estimate does not exceed, is the square of an error
     a that all neighbours share: a² = max(0, E − s² − 1.2 V (1 + 1 / N)). The average of least error of the centre and
     its neighbours weighs these by V / (V + N a²).

@@ -267,7 +267,7 @@ def _least_energy(noisy: Floats, picture: Floats, rate: Floats, albedo: Floats |
 def _energy_of(noisy: Floats, rate: Floats, picture: Floats | None, albedo: Floats | None) -> Floats:
     """Squares of second differences relative to the light, summed over channels: of white noise its variance.
 
-    Of an image, of its difference from a picture, or of its light; in strips, which stay in the caches.
+    The image is `noisy`, its difference from a picture, or its light; in strips, which stay in the caches.
     """
     energy = np.empty(rate.shape, np.float32)
     for top in range(0, len(rate), _STRIP):

@@ -1,4 +1,4 @@
-"""What all tests share: few threads, and a small shot on disk."""
+"""Fixtures of all tests: few threads, and a small shot on disk."""
 
 # ruff: noqa: E402 - the libraries read their numbers of threads when they are imported
 

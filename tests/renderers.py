@@ -35,7 +35,7 @@ class Truth:
 
     @property
     def variance(self) -> np.ndarray:
-        """Of a pixel, as the picture shows it."""
+        """Variance of a pixel, as the picture shows it."""
         kernel = np.array([1, -2, 1], np.float32)
         return cv2.blur((cv2.sepFilter2D(self.color, -1, kernel, kernel) / 6) ** 2, (9, 9))
 
@@ -118,7 +118,7 @@ def magnitude(vectors: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Renderer:
-    """What one renderer makes of a frame.
+    """The output of one renderer for a frame.
 
     Attributes
     ----------
@@ -156,7 +156,7 @@ class Renderer:
 
     @property
     def convention(self) -> MotionConvention:
-        """Of the vectors by plain names."""
+        """Convention of the vectors by plain names."""
         return MotionConvention(self.direction if self.direction != "none" else "previous")
 
 

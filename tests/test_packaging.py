@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.test_house import OURS, ROOT
+from tests.test_structure import OURS, ROOT
 
 # The license's form in setup.cfg needs it; what is built in the tree's own environment asks for no network.
 pytest.importorskip("setuptools", minversion="77", reason="builds the wheel: pip install setuptools>=77")

@@ -318,7 +318,7 @@ def noise_free_around(frame: PreparedFrame, places: Places) -> Mask:
     """Return whether there is no noise around places (K, 2); False where hardly any pixel is lit.
 
     A pixel's color, or its light, color over albedo, is then the mean of those on two sides of it, as far as halves
-    tell. What shows no noise is seen or lit directly, and has no fireflies.
+    show. A pixel without noise is seen or lit directly, and has no fireflies.
     """
     lit, straight = np.zeros((2, len(places)), int)
     near, (height, width) = np.arange(-AROUND, AROUND + 1), frame.valid.shape

@@ -124,7 +124,7 @@ def mirror_region(frame: Frame, region: Region) -> Frame:
 def split_unfiltered(frame: Frame) -> tuple[Array, Unfiltered]:
     """Split a frame's color (H, W, 3) into radiance to denoise, not finite where it is lost, and unfiltered light.
 
-    Of a color outside of the gamut the negative part counts up to the light of the brightest channel. A pixel that is
+    The negative part of a color outside of the gamut counts up to the light of the brightest channel. A pixel that is
     negative in all channels is the trace of a filter with negative lobes next to a lamp, and stays.
     """
     layers = {"color": frame.color, **frame.aovs}

@@ -188,7 +188,7 @@ class AlignedWindow:
 
     @cached_property
     def variance(self) -> Array:
-        """Of the centre's `color`, smoothed, (H, W, 3). Made at the first access."""
+        """The smoothed variance of the centre's `color`, (H, W, 3). Made at the first access."""
         if self.rendered_variance is None:
             return variance_from_window(self.color, self.confidence)
         return smooth_variance(self.rendered_variance)

@@ -138,7 +138,7 @@ def bootstrap_interval(values: Sequence[float] | Array, *, shots: Sequence[int] 
     """95 % percentile bootstrap interval of the mean of `values`, one per frame; NaN if a value is NaN.
 
     To decide whether A is better than B, pass the differences A − B frame by frame: both have the same frames, and most
-    of their spread cancels. An interval that contains 0 is a tie. Of several shots (`shots` has their numbers of
+    of their spread cancels. An interval that contains 0 is a tie. With several shots (`shots` has their numbers of
     values), the shots are resampled first, then the frames within each: frames of one shot are correlated, and more of
     them say little about another shot. Efron 1979, doi:10.1214/aos/1176344552.
     """

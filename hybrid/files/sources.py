@@ -1,4 +1,4 @@
-"""What a picture was made from, to recognize later whether any of it has changed (`--resume`).
+"""The sources of a picture, to recognize later whether any of them has changed (`--resume`).
 
 The header of each result holds the string `MADE_FROM`: JSON with ``files``, a mapping from the use of each file
 (``frame 1001``, ``estimate 1001``) to its name, size in bytes, modification time in seconds, and a hash of its
@@ -18,7 +18,7 @@ from hybrid.files.exr import ExrError, read_exr
 from hybrid.files.replace import refuse_other_kinds
 
 MADE_FROM = "ravg/made-from"
-# Of larger files so many bytes are hashed, in blocks all over: two renders differ everywhere, and an edit in one place
+# Bytes of a larger file that are hashed, in blocks all over: two renders differ everywhere, and an edit in one place
 # changes the time. Reading all of a file would take as long as half a frame.
 HASHED = 2**20
 _BLOCKS = 16

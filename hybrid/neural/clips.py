@@ -58,7 +58,7 @@ def write_clips(
 ) -> list[Path]:
     """Write the training clips of a shot; return the shards (paper, section 6, "Training Data").
 
-    Of each frame `tiles` clips of `tile` pixels a side (0: the whole frame) are placed by `importance` with a seed.
+    In each frame `importance` places `tiles` clips of `tile` pixels a side (0: the whole frame), with a seed.
     `estimate` is the source of the first passes; not "none". Raises ValueError if the levels have no frame in common,
     frames are smaller than a tile, or there is no first pass.
     """

@@ -1,6 +1,6 @@
 """A 3×3 convolution of upsampled features and a skip connection without upsampling them, for inference on CPUs.
 
-Of features enlarged by repetition, the nine taps of a pixel read only four different values: taps that read the same
+In features enlarged by repetition, the nine taps of a pixel read only four different values: taps that read the same
 value are added beforehand. That leaves four ninths of the work, and nothing is enlarged or concatenated.
 """
 

@@ -13,8 +13,8 @@ class KernelWindow(NamedTuple):
 
     color: Tensor  # ``(N, T, 3, H, W)`` irradiance, side frames mixed with the centre where they are not trusted
     confidence: Tensor  # ``(N, T, 1, H, W)`` in [0, 1]
-    # ``(N,)``, positive: brightness of each window as a whole, proportional to its radiance. Of whole frames and never
-    # of tiles: tiles of different exposure would show their seams.
+    # ``(N,)``, positive: brightness of each window as a whole, proportional to its radiance. It belongs to whole
+    # frames, never to tiles: tiles of different exposure would show their seams.
     exposure: Tensor
     # ``(N, T, 3, H, W)``, albedo in [0, 1] mostly, normals in any fixed space
     albedo: Tensor | None = None

@@ -1,7 +1,7 @@
 """Training clips: aligned windows at several noise levels, in shards on disk, and the samples drawn from them.
 
-A shard is a safetensors file that holds clips of one shot, stacked. Of a memory-mapped safetensors file any slice can
-be read by itself: a sample costs what it reads (one clip, one level), no shard is ever loaded, and the order is free.
+A shard is a safetensors file that holds clips of one shot, stacked. Any slice of a memory-mapped safetensors file
+can be read by itself: a sample costs what it reads (one clip, one level), no shard is loaded, and the order is free.
 """
 
 import json
@@ -159,8 +159,8 @@ def noise_pairs(samples: Sequence[float]) -> list[list[tuple[int, str]]]:
 def importance(noisy: Tensor, estimate: Tensor, albedo: Tensor, confidence: Tensor) -> Tensor:
     """Importance (H, W) of each pixel for training: noise, detail, and motion that could not be followed.
 
-    Of images (3, H, W) and confidence (T, 1, H, W) the differences on x/(1+x): |noisy − estimate|, |∇ estimate|, |∇
-    albedo|; and a tenth of the lack of confidence, which would otherwise outweigh all else where an object passes.
+    Images are (3, H, W), confidence (T, 1, H, W). The sum, on x/(1+x), of |noisy − estimate|, |∇ estimate|, |∇ albedo|,
+    and of a tenth of the lack of confidence, which would otherwise outweigh all else where an object passes.
     """
     noisy, estimate = (image.clamp_min(0) / (1 + image.clamp_min(0)) for image in (noisy.float(), estimate.float()))
     result = (noisy - estimate).abs().mean(0) + 0.1 * (1 - confidence.float()).mean((0, 1))

@@ -661,7 +661,7 @@ CHOSEN = [
     ("MULTI_LAYER_IMAGE", "OPEN_EXR_MULTILAYER", "16", "RGBA"),
     ("VIDEO", "FFMPEG", "", "RGB"),
 ]
-# What may become of a render that was begun.
+# The ends of a render that was begun.
 ENDS = {
     "finished": "bpy.ops.ravg.denoise(render=True, existing='REPLACE')",
     "failed": "scene.camera = None; bpy.ops.ravg.denoise(render=True, existing='REPLACE')",
@@ -780,7 +780,7 @@ answer += [files.mute, scene.render.use_overwrite, scene.ravg.lent]
     assert after == [False, True, ""]
 
 
-# What an artist's file may have: nodes on two view layers, a File Output node, a strip in the sequencer.
+# Contents of an artist's file: nodes on two view layers, a File Output node, a strip in the sequencer.
 NODES = """
 layers = [scene.view_layers[0].name, scene.view_layers.new("fog bank").name]
 tree = bpy.data.node_groups.new("Mine", "CompositorNodeTree")

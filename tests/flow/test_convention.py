@@ -134,7 +134,7 @@ def test_a_length_that_is_no_plain_number_is_found_too() -> None:
     choice = choose_convention(film.pairs(lambda n: film.next(n) / np.float32(7.3)), PLAIN, ())
     assert choice.convention is not None
     assert (choice.convention.direction, choice.convention.y) == ("next", "down")
-    # Of 7 px, a fiftieth is what noise hides.
+    # Noise hides a fiftieth of 7 px.
     assert choice.convention.scale == pytest.approx(7.3, rel=0.02)
 
 

@@ -1,4 +1,4 @@
-"""What flows are refined on: comparable, finite, and of a known noise."""
+"""Guides of the flow: comparable, finite, and of a known noise."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def test_cycles_convention_on_a_render_of_a_known_translation() -> None:
         motion = normalize_motion(data["vector"], CYCLES)
     assert motion.to_previous is not None
     assert motion.to_next is not None
-    # What moved by (+3, -2) came from (-3, +2). 1e-3 px: the render's own rounding.
+    # A point that moved by (+3, -2) came from (-3, +2). 1e-3 px: the render's own rounding.
     np.testing.assert_allclose(motion.to_previous.flow, translation(*centre.shape, -3, 2), atol=1e-3)
     np.testing.assert_allclose(motion.to_next.flow, translation(*centre.shape, 4, 1), atol=1e-3)
     assert motion.to_previous.valid.all()

@@ -64,7 +64,7 @@ def test_what_leaves_the_frame_is_no_evidence() -> None:
 
 
 def test_a_noisy_guide_counts_for_little() -> None:
-    """Of two guides the noisy one says the first flow, the clean one the second."""
+    """The noisy one of two guides favors the first flow, the clean one the second."""
     rng = np.random.default_rng(1)
     left, right = rng.random((2, 48, 64), np.float32)
     still, step = np.zeros((48, 64, 2), np.float32), np.full((48, 64, 2), [4, 0], np.float32)

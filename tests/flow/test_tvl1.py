@@ -37,7 +37,7 @@ def test_perturbed_vectors_are_mended(shot: Shot, sigma: float) -> None:
 
 
 def test_it_starts_where_it_is_told_to() -> None:
-    """What moves farther than the coarsest scale can see is found from vectors that are about right only."""
+    """Motion beyond the reach of the coarsest scale is found only from vectors that are about right."""
     far = moved((14.0, -9.0))
     assert error(refine_flow(far.guides, np.zeros_like(far.flow)), far.flow) > 5
     start = far.flow + perturbation(np.random.default_rng(1), 5)
@@ -74,7 +74,7 @@ def test_only_the_tiles_that_call_for_it_are_refined(monkeypatch: pytest.MonkeyP
     start = flow.copy()
     start[110:146, 110:146] += 2
     tiles = refine_flow(guides, start)
-    # What a tile is not called for keeps its vectors to the bit.
+    # Pixels outside of the refined tiles keep their vectors to the bit.
     kept = np.ones((height, width), bool)
     kept[:256, :256] = False
     assert (tiles[kept] == start[kept]).all()

@@ -1,4 +1,4 @@
-"""What enters is checked where it enters, what leaves where it leaves: an error that names the frame, and no file."""
+"""Arrays are checked where they enter and where they leave: an error that names the frame, and no file."""
 
 from __future__ import annotations
 

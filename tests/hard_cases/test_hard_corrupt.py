@@ -145,7 +145,7 @@ def test_a_lost_frame_is_made_of_its_neighbours(preset):
 
 
 def test_a_lost_block_is_made_of_its_neighbours():
-    """What lay in the middle of it was a smear of its rim."""
+    """Its middle was a smear of its rim."""
     frames = shot()
     color = frames[MIDDLE].color.copy()
     block = slice(12, 28), slice(16, 40)

@@ -151,7 +151,7 @@ def test_a_firefly_leaves_neither_hole_nor_halo(value, which, record_property):
             ring[20 - reach : 21 + reach, 28 - reach : 29 + reach] = True
             if reach:
                 ring[21 - reach : 20 + reach, 29 - reach : 28 + reach] = False
-            # What the picture without the firefly is off by, and four deviations of a ring's mean beside: noise of
+            # The error of the picture without the firefly, and four deviations of a ring's mean beside: noise of
             # 0.3 averaged over the window (5) and the ring.
             noise = 4 * 0.3 / np.sqrt(5 * ring.sum())
             error = abs(image[ring].mean() / clean[ring].mean() - 1)

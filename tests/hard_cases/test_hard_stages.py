@@ -33,7 +33,7 @@ anything = settings(
     max_examples=EXAMPLES, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 SIZES = st.sampled_from([(1, 1), (1, 6), (6, 1), (2, 3), (5, 5), (7, 11), (16, 16), (17, 20)])
-# What finite radiance may be: nothing, denormal, half's limit, fireflies.
+# Extremes of finite radiance: nothing, denormal, half's limit, fireflies.
 ODD = np.float32([0, -0.0, 1e-42, 1e-38, 1e-20, 1e-6, 1, 3, 6.5e4, 1e6, 1e12])
 WRONG = np.float32([np.nan, np.inf, -np.inf])
 

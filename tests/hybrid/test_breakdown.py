@@ -1,4 +1,4 @@
-"""What each stage did where: maps in [0, 1] that show it where it was done and nowhere else."""
+"""Maps in [0, 1] that show each stage where it ran and nowhere else."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_the_picture_shows_the_frames_in_the_order_of_time(tmp_path):
 
 @pytest.mark.neural
 def test_a_first_frame_gets_nothing_from_before_it(tmp_path):
-    """Of the first frame of a shot the breakdown of `denoise` names the next one, as the one after."""
+    """The breakdown of a shot's first frame names the next one, as the one after."""
     pytest.importorskip("torch")
     scene = Scene(frames=2, step=(0, 0), height=64, width=64, noise=0.05)
     noisy = scene.write(tmp_path / "noisy")

@@ -76,7 +76,7 @@ def test_options_have_one_name_and_one_group_everywhere(command, capsys):
     assert len(groups) >= 4
 
 
-# Of these each command says more: what comes out, of which networks, what is random, how many of what.
+# Options of which each command says more: its output, which networks, what is random, how many of what.
 SAID_BY_EACH = {
     "--output",
     "--preset",

@@ -58,7 +58,7 @@ def test_our_own_estimate_of_a_frame_does_not_depend_on_the_window_it_is_asked_f
 
 
 def lost_pixels(index, layers):
-    """What a denoiser must not be given."""
+    """Pixels that no denoiser may get."""
     layers["ViewLayer.Combined"][10, 20] = np.inf
     layers["ViewLayer.Denoising Albedo"][5, 6] = np.nan
     layers["ViewLayer.Denoising Normal"] = layers["ViewLayer.Denoising Normal"].copy()
@@ -225,7 +225,7 @@ def test_a_neighbour_without_an_estimate_counts_for_nothing(tmp_path):
 
 
 def denoised(index, layers):
-    """What Cycles writes where it denoises at render time."""
+    """The layers that Cycles writes where it denoises at render time."""
     layers["ViewLayer.Noisy Image"] = layers["ViewLayer.Combined"]
     layers["ViewLayer.Combined"] = SCENE.clean(index)["ViewLayer.Combined"]
 

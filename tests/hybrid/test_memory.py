@@ -1,4 +1,4 @@
-"""What is held from one window to the next: no more than is declared, and no layer that one pixel tells."""
+"""Memory held from one window to the next: no more than is declared, and no layer of one repeated pixel."""
 
 from collections.abc import Mapping
 

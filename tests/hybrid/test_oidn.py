@@ -47,7 +47,7 @@ def rms(a: Image, b: Image) -> float:
 
 @pytest.fixture
 def forgotten():
-    """What was found out about OIDN is forgotten, before and after."""
+    """Clear the cached facts about OIDN, before and after."""
     caches = oidn.why_no_oidn, oidn._device
     for cache in caches:
         cache.cache_clear()

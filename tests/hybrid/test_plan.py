@@ -194,7 +194,7 @@ def test_noise_that_stands_still_is_neither_averaged_nor_taken_for_no_noise(tmp_
 
 
 def test_a_cut_is_seen_in_the_texture_where_both_sides_are_lit_alike(tmp_path):
-    """What would be averaged over it is light divided by the albedo, which alone would not tell."""
+    """The average over it would be of light divided by the albedo, which alone would not show it."""
 
     def cut(index, layers):
         if index >= 2:

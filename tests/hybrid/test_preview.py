@@ -34,7 +34,7 @@ def pair(tmp_path):
 
 
 def level(linear):
-    """What 8-bit sRGB makes of radiance; the middle frame of `pair`, of 0.36, is exposed to 0.18."""
+    """Radiance in 8-bit sRGB; the middle frame of `pair`, of 0.36, is exposed to 0.18."""
     return float(np.round(encode_srgb(np.float32(linear / 2)) * 255))
 
 

@@ -19,7 +19,7 @@ FRAMES = truths()
 
 
 def run(command: str, spec: Path, out: Path | None, *options: str) -> str:
-    """What the command says."""
+    """The output of the command."""
     said = io.StringIO()
     arguments = [command, str(spec), *([] if out is None else ["-o", str(out)]), *options]
     with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
@@ -38,7 +38,7 @@ def denoised(spec: Path, out: Path, *options: str) -> tuple[dict[int, np.ndarray
 
 
 def options(renderer: Renderer) -> list[str]:
-    """What is asked for: only non-local means look at the variance, and they take time."""
+    """The stages that are asked for: only non-local means read the variance, and they take time."""
     return ["--frames", "10", "--preset", "standard" if "variance" in renderer.roles else "draft"]
 
 

@@ -80,7 +80,7 @@ def flicker(shot, scene, rules):
 def test_errors_that_change_from_frame_to_frame_are_averaged(tmp_path, scene):
     shot = open_shot(scene.write(tmp_path))
     alone, steady = flicker(shot, scene, ALONE), flicker(shot, scene, STEADY)
-    # Of equal weights the deviation is 1/√3. A pixel moved by whole pixels is not interpolated.
+    # With equal weights the deviation is 1/√3. A pixel moved by whole pixels is not interpolated.
     assert steady == pytest.approx(alone / np.sqrt(3), rel=0.05)
 
 
@@ -99,7 +99,7 @@ def test_it_is_the_average_weighted_by_confidence(tmp_path):
 
 
 def test_light_that_has_changed_by_less_than_the_noise_stays_with_its_frame(tmp_path):
-    """What is averaged of a neighbour is its detail: without `relight` the picture is 3.1 % too bright."""
+    """Only a neighbour's detail is averaged: without `relight` the picture is 3.1 % too bright."""
     shot, own = open_shot(STILL.write(tmp_path)), nearly(STILL)
 
     def make(aligned):
@@ -131,7 +131,7 @@ def test_where_nothing_tells_whether_light_drifts_neighbours_count_half(tmp_path
 
 
 def under_a_shadow(index, width):
-    """What is left of the light under a soft edge that moves by three pixels a frame."""
+    """The light left under a soft edge that moves by three pixels a frame."""
     return 0.5 + 0.5 / (1 + np.exp(-(np.arange(width) - width / 2 - 3 * (index - 3)) / 3))[None, :, None]
 
 
@@ -320,7 +320,7 @@ def test_detail_that_the_neighbours_lack_stays(tmp_path):
 
 
 class TestMean:
-    """What denoisers lose of the light comes back, fireflies included, and no single sample is spread."""
+    """Light that denoisers lose comes back, fireflies included, and no single sample is spread."""
 
     SCENE = Scene(height=160, width=200, frames=3, step=(0, 0), noise=0.5)
     NUMBER = SCENE.first + 1
@@ -427,7 +427,7 @@ class TestInFiles:
         frames = self.run(shot, tmp_path / "out", make, keep_going=True)
         assert [type(frame).__name__ for frame in frames].count("Failed") == 1
         assert read_exr(tmp_path / "out" / f"shot.{MIDDLE}.exr").parts[0].header[BESIDE] == f"{MIDDLE - 1}"
-        # What is whole now was not then: those beside it are made again, and no others.
+        # The frame failed then and is whole now: those beside it are made again, and no others.
         broken.clear()
         again = self.run(shot, tmp_path / "out", make, resume=True)
         assert [frame.number for frame in again if not frame.resumed] == [MIDDLE, MIDDLE + 1, MIDDLE + 2]
@@ -512,7 +512,7 @@ class TestSamples:
         np.testing.assert_allclose(result, truth(STILL, MIDDLE), rtol=1e-3)
 
     def test_a_black_frame_between_lit_ones_is_black(self, tmp_path):
-        """What leaked into it from its neighbours was an error: a fade from black was not written at all."""
+        """Light that leaked into it from its neighbours was an error: a fade from black was not written at all."""
 
         def dark(index, layers):
             layers["ViewLayer.Combined"] *= index != 3

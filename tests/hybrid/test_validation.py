@@ -191,7 +191,7 @@ PRESET = {"variance": ("--preset", "standard")}
 
 @pytest.fixture(scope="module")
 def absence(tmp_path_factory) -> Callable[[str], float]:
-    """What is reached without a layer."""
+    """The result without a layer."""
     folder, kept = tmp_path_factory.mktemp("absent"), {}
 
     def measure(name: str) -> float:

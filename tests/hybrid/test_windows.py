@@ -331,7 +331,7 @@ def test_without_vectors_a_drift_of_one_pixel_shows_in_the_guides(tmp_path, nois
 
 
 def test_estimates_are_compared_in_any_case(tmp_path):
-    """What single frames' denoisers make of a calm shot may differ by itself: the gate costs nothing there."""
+    """Denoised single frames of a calm shot may differ: the gate costs nothing there."""
     shot = open_shot(CALM.write(tmp_path))
     estimates = PerFrame(lambda frame: frame.color * np.float32(1 + 0.5 * (frame.number == 1005)))
     window = FrameStream(shot, Rules(), first_pass=estimates).align(1006)

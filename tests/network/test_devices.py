@@ -1,4 +1,4 @@
-"""What torch computes on goes by the names that OIDN has."""
+"""Devices of torch have OIDN's names."""
 
 # ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
 

@@ -75,7 +75,7 @@ def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
     return float(-10 * (a - b).square().mean().log10())
 
 
-# What enters
+# Inputs
 
 
 def test_the_frames_are_what_is_gathered_by_hand() -> None:

@@ -98,7 +98,7 @@ def test_running_gives_what_training_sees(made_up: OidnUNet) -> None:
     picture = torch.rand(2, 9, 48, 32, generator=torch.Generator().manual_seed(3))
     with torch.no_grad():
         running = made_up(picture)
-    # Of nine layers of some hundred products each; pictures lie in [0, 1].
+    # The rounding of nine layers of some hundred products each; pictures are in [0, 1].
     torch.testing.assert_close(running, made_up(picture).detach(), rtol=0, atol=1e-5)
 
 

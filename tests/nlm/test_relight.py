@@ -35,7 +35,7 @@ def test_a_change_that_is_even_is_taken_away_and_detail_stays(rng):
     np.testing.assert_array_equal(window[1], before[1])
     assert before[0].mean() / texture.mean() == pytest.approx(1.3, abs=0.01)
     assert window[0].mean() / texture.mean() == pytest.approx(1, abs=0.003)
-    # Its errors are its own, 2 % and little more. Of the centre's it has what the light of both has of them, an eighth,
+    # Its errors are its own, 2 % and little more. The centre's enter it through the light of both, by an eighth,
     # the other way round.
     errors = window[:2] / texture - 1
     assert errors[0].std() == pytest.approx(0.0215, abs=0.003)

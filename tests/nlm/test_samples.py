@@ -230,7 +230,7 @@ def test_the_variance_of_noise_that_a_pixel_filter_spreads_is_measured(spread: f
 
 
 def test_texture_in_the_albedo_is_no_noise() -> None:
-    """Of this wall it was 0.16, and pictures at 60 dB were left as they were."""
+    """On this wall it was 0.16, and pictures at 60 dB were left as they were."""
     albedo = np.random.default_rng(3).uniform(0.2, 0.8, (24, 32, 3)).astype(np.float32).repeat(4, 0).repeat(4, 1)
     own = noisy(albedo, 0.01, 8)
     found = spatial_variance(own, np.full_like(own, 0.5), 1 / albedo.mean(axis=-1), albedo)
@@ -298,7 +298,7 @@ def test_lost_light_comes_back_and_noise_stays_out() -> None:
     dark = restore_mean(np.float32(0.97) * truth, own, 0.8)
     # 25 600 pixels with a deviation of a half: their mean is known to 0.3 %, and counts nearly in full.
     assert abs(dark.mean() / truth.mean() - 1) < 0.006
-    # What is right already moves by no more than its noise, and most of it hardly at all.
+    # A correct picture moves by no more than its noise, and most of it hardly at all.
     right = np.abs(restore_mean(truth, own, 0.8) / truth - 1)
     assert right.max() < 0.04
     assert np.median(right) < 0.005
@@ -331,7 +331,7 @@ def test_the_mean_of_the_dark_is_that_of_its_own_samples(dark: float, wrong: flo
 
 
 def test_means_that_thousands_of_samples_show_are_restored() -> None:
-    """Of a difference of 3 % that is known to 0.3 % a tenth stayed."""
+    """A tenth of a difference of 3 % that is known to 0.3 % stayed."""
     truth = np.full_like(ONES, 0.5)
     own = noisy(truth, 0.35, 9)
     result = restore_mean(np.float32(0.97) * truth, own, 0.35)
@@ -449,7 +449,7 @@ def test_the_light_of_a_picture_with_too_little_contrast_is_restored(scale: floa
     picture[:, :30], noisy[:, :30] = truth[:, :30] * np.float32(0.003), noisy[:, :30] * np.float32(0.003)
     restored = restore_mean(picture, noisy, 0.2 * scale)
     assert restored.mean() == pytest.approx(noisy.mean(), rel=0.005)
-    # What is dark beside it, and right, stays: a factor of the whole picture made it 3 % too bright.
+    # The dark part beside it, which is right, stays: a factor of the whole picture made it 3 % too bright.
     assert restored[:, :30].mean() == pytest.approx(picture[:, :30].mean(), rel=0.01)
 
 

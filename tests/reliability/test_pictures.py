@@ -288,7 +288,7 @@ PLACES = [(12, 16), (20, 34), (8, 40), (25, 8)]
      (5000.0, "none", 4), (5000.0, "oidn", 4)],
 )  # fmt: skip
 def test_a_spark_leaves_no_ring(folder, value, estimate, count):
-    """Of light in 9×13 pixels around it."""
+    """A spark leaves no ring of light in 9×13 pixels around it."""
 
     def late(index: int, layers: Layers) -> None:
         for at in PLACES[:count] if index == 2 else ():

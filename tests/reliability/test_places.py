@@ -284,7 +284,7 @@ def nothing(folder: Path) -> None:
 
 
 FRAMES = "in/shot.####.exr"
-# What is done before; what is written where; how it ends.
+# The preparation; the options; how it ends.
 ODD: dict[str, tuple[Make, Sequence[str], str]] = {
     "an output by a link to a folder": (lambda f: [(f / "real").mkdir(), linked(f, "out", "real")], ["-o", "out"], "works"),
     "an output by a link to the input": (lambda f: linked(f, "out", "in"), ["-o", "out"], "refused"),

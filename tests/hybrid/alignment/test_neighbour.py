@@ -1,4 +1,4 @@
-"""What a neighbour shows of the centre, and how far it is trusted."""
+"""A neighbour warped to the centre, and how far it is trusted."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def test_noise_within_the_limit_is_left_alone():
 
 
 def test_one_firefly_brightens_nothing():
-    """What is cut off from it is no light that anything around it lacks."""
+    """The light that the limit removes from it is missing nowhere around it."""
     first_pass = np.ones((120, 160, 3), np.float32)
     noisy = first_pass.copy()
     noisy[60, 80] = 1e6

@@ -1,4 +1,4 @@
-"""What a window of aligned frames gives when it is asked: the centre in the place of others, guides of all frames."""
+"""A window of aligned frames: the centre in the place of missing ones, guides of all frames."""
 
 from __future__ import annotations
 

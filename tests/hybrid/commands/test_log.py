@@ -1,4 +1,4 @@
-"""What a command tells: lines, JSON, Open Job Description; closed pipes and terminals that know only ASCII."""
+"""The log of a command: lines, JSON, Open Job Description; closed pipes and terminals that print only ASCII."""
 
 import json
 import os

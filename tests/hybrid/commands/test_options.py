@@ -53,7 +53,7 @@ def test_each_text_is_that_of_an_option(command):
 
 
 class AskedError(Exception):
-    """What `Job.open` was asked for."""
+    """The options that `Job.open` gets."""
 
 
 @pytest.mark.neural

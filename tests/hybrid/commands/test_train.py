@@ -264,7 +264,7 @@ NOT_OFFERED = {"weight_decay"}
 
 @pytest.fixture
 def asked(monkeypatch):
-    """What the command asks the network's side for, which trains nothing."""
+    """The calls of `train_network`, which trains nothing here."""
     calls = []
     monkeypatch.setattr("hybrid.neural.train_network", lambda *given, **more: calls.append((given, more)))
     return calls

@@ -19,7 +19,7 @@ NOISY = {"noisy": METHODS["noisy"]}
 
 @dataclass(eq=False)
 class MemoryShot:
-    """What a method uses of a `Shot`, without files."""
+    """The members of a `Shot` that a method uses, without files."""
 
     frames: dict[int, Frame]
 

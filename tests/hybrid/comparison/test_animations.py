@@ -23,7 +23,7 @@ def sheet(text: str) -> np.ndarray:
 
 
 def expected(level: float, number: int, exposure: float) -> float:
-    """What 8 bits show of a flat frame: the tone curve at the exposure that makes the reference, 0.5, a middle gray."""
+    """A flat frame in 8 bits: the tone curve at the exposure that makes the reference, 0.5, a middle gray."""
     x = exposure * 2 ** mid_exposure(exposure, 0.5 * 1.5) * level * (1 + 0.5 * (number - 8))
     return float(255 * encode_srgb(np.float32(x / (1 + x))))
 

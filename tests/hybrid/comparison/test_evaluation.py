@@ -89,7 +89,7 @@ def test_flip_is_the_mean_of_its_maps(tmp_path: Path) -> None:
 
 
 def test_the_shots_exposure_reaches_every_measure() -> None:
-    """Of very little light at a high exposure all measures are those of the light that it brings about.
+    """Very little light at a high exposure has the measures of as much light as the exposure makes of it.
 
     FLIP finds exposures of its own; they agree for all light but that below `hybrid.comparison.flip.BLACK`.
     """

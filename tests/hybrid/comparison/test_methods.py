@@ -1,4 +1,4 @@
-"""What a comparison runs: methods give finite frames nearer to the truth."""
+"""The methods of a comparison give finite frames nearer to the truth."""
 
 from __future__ import annotations
 

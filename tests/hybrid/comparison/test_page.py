@@ -183,7 +183,7 @@ def color(page: Any, x: float, y: float = 0.5) -> list[int]:
 
 
 def shown(page: Any, method: str, number: int = 9, ev: float | None = None) -> list[int]:
-    """What a method's flat picture looks like, from the page's own definition."""
+    """A method's flat picture, from the page's own definition."""
     gain = EXPOSURE * 2 ** (float(page.input_value("#ev")) if ev is None else ev)
     x = gain * LEVELS[method] * (1 + 0.5 * (number - 8))
     tone = x / (1 + x)

@@ -1,4 +1,4 @@
-"""What was measured: who is best and what ties, the front, stages, several shots, and all of it as JSON."""
+"""Results of a comparison: the best and ties, the front, stages, several shots, and all of it as JSON."""
 
 from __future__ import annotations
 

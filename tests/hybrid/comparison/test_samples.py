@@ -1,4 +1,4 @@
-"""What a denoiser is worth in samples: made-up errors whose answer is known."""
+"""The worth of a denoiser in samples: made-up errors whose answer is known."""
 
 from __future__ import annotations
 

@@ -353,7 +353,7 @@ def test_one_layer_is_one_aov(tmp_path):
 
 @pytest.mark.parametrize("role", ["color", "alpha"])
 def test_an_aov_that_is_called_like_what_is_written_needs_its_whole_name(tmp_path, role):
-    """What is written goes by these two words; an AOV of that name took the picture's place."""
+    """These are the names of written layers; an AOV of that name took the picture's place."""
     image = headers(tmp_path, [*cycles_names(), f"light.{role}.R", f"light.{role}.G", f"light.{role}.B"])
     with pytest.raises(ExrError, match=rf"aov '{role}' is also a role, expected the whole name: light\.{role}\.RGB"):
         find_layers(image, aovs=[role])

@@ -1,4 +1,4 @@
-"""What is known of a shot's layers, in one of its frames."""
+"""The layers of a shot, in one of its frames."""
 
 from __future__ import annotations
 

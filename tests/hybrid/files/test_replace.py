@@ -1,4 +1,4 @@
-"""What is written: whole or not at all, and never over somebody else's file."""
+"""Files are written whole or not at all, and never over somebody else's file."""
 
 from __future__ import annotations
 

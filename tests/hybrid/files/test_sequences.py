@@ -151,7 +151,7 @@ def test_negative_numbers_are_padded_with_their_sign(tmp_path, form):
 
 
 def test_negative_numbers_with_nothing_before_them(tmp_path):
-    """Of -0002 to 0001 half was left out, or the order was reversed: the hyphen was taken for a name."""
+    """Half of -0002 to 0001 was left out, or the order was reversed: the hyphen was taken for a name."""
     names = ["-0002.exr", "-0001.exr", "0000.exr", "0001.exr"]
     for name in names:
         (tmp_path / name).touch()

@@ -128,7 +128,7 @@ def test_frames_around_those_asked_for_are_those_there_are(tmp_path):
     assert shot.with_neighbours(0).numbers == (3, 5)
     assert shot.with_neighbours(2).numbers == (1, 2, 3, 5, 6)
     assert shot.numbers == (3, 5)
-    # Of these files alone the step would be 2.
+    # The step of these files alone would be 2.
     made = shot.reopened({number: shot.path(number) for number in (1, 3, 5)})
     assert (made.numbers, made.step, shot.step) == ((3, 5), 1, 1)
     assert made.has(1)

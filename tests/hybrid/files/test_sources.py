@@ -1,4 +1,4 @@
-"""What a picture was made from, and why it is made again."""
+"""The sources of a picture, and why it is made again."""
 
 from __future__ import annotations
 

@@ -163,7 +163,7 @@ def test_tiles_without_noise_are_left_as_they_are(tmp_path, weights):
     denoiser = open_network(weights, tile=16, precision="float32")
     aligners = [FrameStream(shot, only(STAGES | extra), first_pass=Classical(DRAFT)) for extra in (set(), {"skip"})]
     images = [denoiser(aligner.align(SCENE.first + 2)).color for aligner in aligners]
-    # What is lit is mirrored by 32 pixels. A trunk leaves next to nothing where there is nothing: 0.002 beside an edge.
+    # Lit pixels are mirrored by 32 pixels. A trunk leaves next to nothing where there is nothing: 0.002 beside an edge.
     np.testing.assert_allclose(images[1], images[0], atol=1e-6 if weights.stem == "untrained" else 5e-3)
     assert images[1][:, 100:].max() < 1e-3
     assert (images[1][:, 240:] == 0).all()  # exactly what was there

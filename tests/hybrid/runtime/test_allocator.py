@@ -1,4 +1,4 @@
-"""What is freed is kept where the C library is glibc."""
+"""Freed memory is kept where the C library is glibc."""
 
 from __future__ import annotations
 

@@ -103,7 +103,7 @@ def test_where_nothing_can_be_written_to_loops_are_compiled_in_each_run(installe
 
 @pytest.mark.posix
 def test_a_folder_that_somebody_else_has_made_is_not_trusted(installed, temporary):
-    """What is read from it is run."""
+    """Files in it are run."""
     user = NOBODY if os.geteuid() == 0 else os.geteuid()
     planted = temporary / f"ravg-compiled-{user}"
     planted.mkdir()

@@ -54,7 +54,7 @@ with tolerant_streams(), open({str(path)!r}, "w") as file:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes without a reader are no error there")
 def test_a_standard_error_that_nobody_reads_does_not_end_the_reading(tmp_path):
-    """What others print while a file is read is passed on afterwards."""
+    """Lines that others print while a file is read are passed on afterwards."""
     path = Scene(frames=1).write(tmp_path) / "shot.1001.exr"
     run = f"""
 from hybrid.files import exr

@@ -57,7 +57,7 @@ def test_all_libraries_are_limited_whether_torch_is_there_already_or_not(first):
 @pytest.mark.parametrize("name", ["NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"])
 @pytest.mark.parametrize("count", ["abc", "0", "-1", "1.5", "100000", "4,x", "9" * 5000])
 def test_numbers_of_threads_that_are_none_are_one_line(name, count, shot_folder, monkeypatch, capsys):
-    """Of numba came a traceback in a warning, a segmentation fault, or a line that did not name the variable."""
+    """numba gave a traceback in a warning, a segmentation fault, or a line that did not name the variable."""
     monkeypatch.setenv(name, count)
     assert main(["inspect", str(shot_folder)]) == 1
     said = capsys.readouterr().err.splitlines()

@@ -209,7 +209,7 @@ def test_vectors_lead_to_the_same_point_one_frame_on(rendered):
 def errors_of_vectors(scene, channels):
     """Return how far vectors are from where the objects' transforms take what is seen, in pixels: (2, N).
 
-    Previous and next frame. What deforms has no transform that tells, and is left out, as is what hair is before:
+    Previous and next frame. Deforming objects have no such transform, and are left out, as is all that is behind hair:
     Blender's rays pass it.
     """
     from hybrid.simulate.effects import film_pixel, visible_points

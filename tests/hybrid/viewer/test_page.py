@@ -79,7 +79,7 @@ def settle(tab: Any, number: int) -> None:
 
 
 def pixel(tab: Any, x: float, y: float = 0.5) -> list[int]:
-    """What is on the canvas, at fractions of its size."""
+    """Pixels of the canvas, at fractions of its size."""
     return tab.evaluate(
         "([x, y]) => { const c = document.querySelector('#canvas');"
         " return [...c.getContext('2d').getImageData(x * c.width, y * c.height, 1, 1).data].slice(0, 3); }",

@@ -1,4 +1,4 @@
-"""What is compiled beside a first run is all of this package that the run needs."""
+"""The program beside a first run compiles all of this package that the run needs."""
 
 # ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
 

@@ -1,4 +1,4 @@
-"""What is made in one pass is what torch gives."""
+"""Operations in one pass give what torch gives."""
 
 # ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
 

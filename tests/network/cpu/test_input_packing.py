@@ -1,4 +1,4 @@
-"""What is laid out in one pass is what plain operations make."""
+"""Inputs packed in one pass are those of plain operations."""
 
 # ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
 

@@ -1,4 +1,4 @@
-"""What is convolved without being enlarged is what plain operations make of enlarged features."""
+"""A convolution without upsampling gives what plain operations give on upsampled features."""
 
 # ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
 
@@ -52,7 +52,7 @@ def test_in_bfloat16_it_is_nearly_as_exact_as_plain_operations(size: tuple[int, 
         found, plain = stage.upsample(x, skip), stage(both)
     assert found.dtype == torch.bfloat16
     error, expected = (float((layer.double() - exact).square().mean()) for layer in (found, plain))
-    # What the enlarged features give is rounded once before the rest is added to it, as the sum is afterwards.
+    # The upsampled features' part is rounded once before the rest is added to it, as the sum is afterwards.
     assert error < 2 * expected
 
 

@@ -1,4 +1,4 @@
-"""What the network sees of a window."""
+"""The network's inputs from a window."""
 
 # ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
 

@@ -156,7 +156,7 @@ def test_samples_of_a_batch_do_not_touch_each_other(build) -> None:  # type: ign
 
 @pytest.mark.parametrize("scales", [(), (0,), (1,), (2,), (0, 1, 2)])
 def test_only_robust_average_blocks_connect_the_frames(scales: tuple[int, ...]) -> None:
-    """What the head says of frame 0, before the frames' taps are normalised together, when frame 2 changes."""
+    """The head's output for frame 0, before the frames' taps are normalised together, when frame 2 changes."""
     model = small_unet(ra_scales=scales)
     seen: list[torch.Tensor] = []
     model.head.window.register_forward_hook(lambda module, inputs, output: seen.append(output))

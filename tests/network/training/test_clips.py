@@ -299,7 +299,7 @@ def test_a_sample_is_a_function_of_seed_and_number(tmp_path: Path) -> None:
 
 
 def test_samples_are_drawn_from_all_noise_levels_and_all_targets(tmp_path: Path) -> None:
-    """What a level is trained towards are all of its pairs, about equally often."""
+    """A level is trained towards all of its pairs, about equally often."""
     clip = make_clip()
     for level in range(3):  # told apart by their modulation, and by their target
         clip.modulation[level] = level + 1

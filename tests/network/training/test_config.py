@@ -1,4 +1,4 @@
-"""What determines a training: wrong settings are named, and no torch is needed to know the right ones."""
+"""Settings of a training: wrong ones are named, and no torch is needed to check them."""
 
 from __future__ import annotations
 

@@ -155,7 +155,7 @@ def test_the_loss_of_differences_is_that_of_errors_compared_along_the_motion() -
 def test_an_error_that_stays_with_the_motion_does_not_flicker() -> None:
     pair = a_pair()
     error = uniform(1, 3, 8, 8, seed=2)
-    # What is at (y, x) in the first frame is at (y − 1, x + 2) in the second.
+    # The point at (y, x) in the first frame is at (y − 1, x + 2) in the second.
     moved = error.roll((-1, 2), (-2, -1))
     pair["images"] = pair["targets"] + torch.stack([error, moved], 1)
     assert float(difference_loss(display, **pair)) < 1e-20

@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -37,7 +38,7 @@ def test_only_neural_imports_torch_and_the_network():
     assert len(files) > 10
     learned = {path for path in files if imports(path) & {"torch", "network", "safetensors"}}
     assert learned
-    # The command tells the defaults of a training, which need no torch.
+    # The command states the defaults of a training, which need no torch.
     command = ROOT / "hybrid" / "commands" / "train.py"
     assert {path.parent for path in learned - {command}} == {ROOT / "hybrid" / "neural"}
     assert imports(command) & {"torch", "network", "safetensors"} == {"network"}
@@ -62,27 +63,27 @@ def modules_of_hybrid() -> dict[str, set[str]]:
     return graph
 
 
-def room_of(module: str) -> str:
-    """The room of a module: a package of arrays, or what stands directly in `hybrid`."""
+def package_of(module: str) -> str:
+    """Name the row of a module: a top-level package, or a module or package directly in `hybrid`."""
     return module.split(".")[0] if not module.startswith("hybrid.") else ".".join(module.split(".")[:2])
 
 
-def test_the_map_shows_who_imports_whom():
+def test_the_table_shows_which_package_imports_which():
     text = (DEVELOPERS / "architecture.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `([\w.]+)` \| [^|]*\| ([^|]*) \|$", text, re.M)
-    drawn = {room: set() if names == "–" else set(names.split(", ")) for room, names in rows}
+    drawn = {package: set() if names == "–" else set(names.split(", ")) for package, names in rows}
     built: dict[str, set[str]] = {}
     for path in (path for package in sorted(OURS) for path in (ROOT / package).rglob("*.py")):
-        own = room_of(".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"))
+        own = package_of(".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"))
         if own == "hybrid":
             continue
         found = built.setdefault(own, set())
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in OURS:
                 full = [f"hybrid.{a.name}" for a in node.names] if node.module == "hybrid" else [node.module]
-                found |= {room_of(name) for name in full}
+                found |= {package_of(name) for name in full}
             elif isinstance(node, ast.Import):
-                found |= {room_of(a.name) for a in node.names if a.name.split(".")[0] in OURS}
+                found |= {package_of(a.name) for a in node.names if a.name.split(".")[0] in OURS}
         found.discard(own)
     assert drawn == built
 
@@ -118,7 +119,7 @@ WITHOUT_TESTS_OF_THEIR_OWN = {
 
 
 @pytest.mark.parametrize("package", sorted(OURS))
-def test_a_modules_tests_are_where_anyone_would_look(package):
+def test_a_modules_tests_are_in_the_same_place(package):
     modules = [path.relative_to(ROOT) for path in (ROOT / package).rglob("*.py") if path.name != "__init__.py"]
     assert modules
     without = {
@@ -243,6 +244,36 @@ def test_functions_that_users_import_document_their_parameters():
     assert len(functions) > 50
     for least, node in functions:
         assert len(parameters(node)) < least or documented_parameters(node), f"{node.name} has no section"
+
+
+SENTENCE = re.compile(r"(?:\A|[.:!?] +|\n\s*\n\s*)((?:What|Of|Whose) [^.?!]*)(?:[.!:]|\Z)")
+
+
+def texts(path: Path) -> Iterator[str]:
+    """Docstrings and comments of a file; comments on adjacent lines are one."""
+    source = path.read_text(encoding="utf-8")
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            yield ast.get_docstring(node) or ""
+    comment: list[str] = []
+    for line in source.splitlines():
+        if line.lstrip().startswith("#"):
+            comment.append(line.lstrip().lstrip("#:").strip())
+        else:
+            yield "\n".join(comment)
+            comment = []
+    yield "\n".join(comment)
+
+
+def test_no_sentence_begins_with_what_or_of():
+    """The subject comes first (docs/dev/conventions.md); questions may begin with "What"."""
+    folders = [*sorted(OURS), "benchmarks", "blender", "examples", "tests"]
+    files = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
+    found = [f"{path}: {text}" for path in files for part in texts(path) for text in SENTENCE.findall(part)]
+    assert found == []
+    assert SENTENCE.findall("It runs. What is left stays.") == ["What is left stays"]
+    two = "What is in memory? Of frames, all.\n\nOf all\nothers none"
+    assert SENTENCE.findall(two) == ["Of frames, all", "Of all\nothers none"]
 
 
 def test_the_core_imports_no_peer_at_start():
