@@ -10,7 +10,7 @@ from numba import njit
 from flow.warp import interpolate, locate, warp, weigh
 from loops.parallel import run_bands
 
-# Longer than any frame is wide: renderers write 1e9, 1e10 or similar where they know no motion.
+# Longer than any frame is wide: renderers write 1e9, 1e10 or similar where motion is unknown.
 ABSURD_LENGTH = 1e4
 
 DIRECTIONS = {

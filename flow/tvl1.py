@@ -296,7 +296,7 @@ def _linearize(
                 trust = square / (square + noise[y, x, g] * noise[y, x, g] + np.float32(1e-9))
                 data[0, g, y, x] = value - centre[y, x, 3 * g] - ax * u - ay * v
                 data[1, g, y, x], data[2, g, y, x] = ax, ay
-                # 1e-9: a slope of 3e-5 of the guide's range per pixel, below what 8 bits could tell from flat.
+                # 1e-9: a slope of 3e-5 of the guide's range per pixel, below what 8 bits distinguish from flat.
                 data[3, g, y, x] = one / (square + np.float32(1e-9))
                 data[4, g, y, x] = _THETA * attachment * trust if place.inside else np.float32(0)
 

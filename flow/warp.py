@@ -55,7 +55,7 @@ def interpolate(
     image: np.ndarray, channel: int, place: Place, weights: tuple[np.float32, np.float32, np.float32, np.float32]
 ) -> np.float32:
     """Sample a channel bilinearly at a place of `locate` with the weights of `weigh`."""
-    # Unsigned: of a signed index numba asks each time whether it counts from the end.
+    # Unsigned: with a signed index numba tests each time whether it counts from the end.
     x0, y0, x1, y1 = np.uintp(place.x0), np.uintp(place.y0), np.uintp(place.x1), np.uintp(place.y1)
     value: np.float32 = (
         weights[0] * image[y0, x0, channel] + weights[1] * image[y0, x1, channel]
@@ -124,7 +124,7 @@ def _sample_bicubic(image: np.ndarray, channel: Any, columns: Four, rows: Four, 
     return value
 
 
-# Unsigned: of a signed index numba asks each time whether it counts from the end.
+# Unsigned: with a signed index numba tests each time whether it counts from the end.
 @njit(nogil=True, cache=True)
 def _bicubic(
     first: int, last: int, image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarray, inside: np.ndarray

@@ -29,7 +29,7 @@ class Entry(NamedTuple):
 
 
 COMMANDS = {name: Entry(**entry) for name, entry in TEXTS["commands"].items()}
-# Old name → new name, and options that stand for the old defaults; accepted for one release.
+# Old name → new name, and options that state the old defaults; accepted for one release.
 OLD_COMMANDS = {"pseudoref": ("denoise", ["--preset=standard"]), "prepare": ("make-clips", [])}
 OLD_OPTIONS = {
     "--beside": "--with-report",

@@ -27,7 +27,7 @@ from hybrid.validation import LOST, find_lost_light, find_other_frame, find_sequ
 from nlm.average import replace_nonfinite
 from nlm.fireflies import Highlights, clamp_halos
 
-GUIDE_RADIUS = 1  # frames on each side that tell whether a frame's guides hold noise
+GUIDE_RADIUS = 1  # frames on each side that show whether a frame's guides hold noise
 # Each frame is denoised in one of eight orientations, by its number: the errors of a network in an image and in the
 # image turned differ, and average out over a window. Noise that stands still is not averaged.
 ORIENTATIONS = 8
@@ -284,7 +284,7 @@ def _run_mode(mode: str, frame: Frame, noisy_guides: bool = True, *, denoise: Ca
 
 
 def _orientation(stream: FrameStream, number: int) -> int:
-    """The orientation of a frame's number; 0 where its noise is that of a frame beside it, or frames cannot tell.
+    """The orientation of a frame's number; 0 where its noise is that of a frame beside it, or cannot be compared.
 
     The errors of frames with equal noise would differ, and flicker.
     """

@@ -147,7 +147,7 @@ class DenoiseOptions:
                 "--budget chooses the preset, expected no other --preset than auto with it, and no --weights"
             )
         if self.breakdown is not None and self.max_memory is not None:
-            raise ValueError("--breakdown looks at whole frames, expected no --max-memory with it")
+            raise ValueError("--breakdown needs whole frames, expected no --max-memory with it")
         rules = self.rules
         if self.method == "network":
             return

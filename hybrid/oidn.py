@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 Quality = Literal["high", "balanced", "fast"]
 # About what OIDN may take for itself; above about 1000×1000 pixels it works in tiles, which overlap. Always the same,
-# or its pictures would depend on the memory that somebody happens to allow. Its small networks take no longer with half
+# or its pictures would depend on the memory that happens to be allowed. Its small networks take no longer with half
 # of it, at 1920×1080 and to the same bits; the others a quarter longer.
 MEMORY_MB = {"high": 1024, "balanced": 1024, "fast": 512}
 # Bytes that it then takes at most, its code and buffers included, by measurement; and with quality fast.

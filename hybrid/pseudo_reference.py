@@ -85,7 +85,7 @@ def gated_average(aligned: AlignedWindow, *, timings: Timings | None = None) -> 
     """Average the first passes, ValueError without, of frames that show the same light; radiance (H, W, 3), finite.
 
     ``Σ c_t e_t / Σ c_t``, c the confidence: the greater of geometry's, times the color gate (`nlm.gate`) where the plan
-    has it, and 0.3 times the gate. Geometry cannot tell which pixels of an outline are alike; their colors can.
+    has it, and 0.3 times the gate. Colors show which pixels of an outline are alike, geometry does not.
     """
     if aligned.first_pass is None:
         raise ValueError("aligned: expected a window with estimates, got none")

@@ -195,7 +195,7 @@ class FrameDenoiser:
         outliers = 0
         for band in bands:
             assert window is not None
-            # A function may stand for a denoiser.
+            # A denoiser may be a plain function.
             ranged, guided = getattr(self.denoise, "clamps", False), getattr(self.denoise, "guided", True)
             aligned = align(window, band, ranged=ranged, guided=guided, timings=stream.timings)
             if band is bands[-1]:

@@ -143,7 +143,7 @@ def _average(first: int, last: int, window: Floats, weight: Floats, out: Floats)
             for c in range(C):
                 value = np.float32(0)
                 for t in range(T):
-                    if weight[t, y, x] > 0:  # a NaN that nobody trusts must not count
+                    if weight[t, y, x] > 0:  # a NaN of weight 0 must not count
                         value += weight[t, y, x] * window[t, y, x, c]
                 out[y, x, c] = value / total if total > 0 else window[T // 2, y, x, c]
 

@@ -20,7 +20,7 @@ _EXCESS_SIZE, _SCATTER_SIZE = (11, 11), (21, 21)
 _SURE = np.float32(1.2)
 # Frames of less confidence do not count: their squares vanish in float32, and their inverse is infinite.
 _LEAST_WEIGHT = np.float32(1e-6)
-# Neighbours, of equal confidence, that there must be to know their scatter.
+# Least number of neighbours, of equal confidence, from which their scatter is estimated.
 _LEAST_COUNT = np.float32(1.5)
 # q = share · s + _FLOOR in tone-mapped units: a difference of means of a third of the centre's noise is noise; 0.004,
 # one step of 8 bits, is the difference of the estimates without noise.

@@ -48,7 +48,7 @@ _LIMIT = np.float32(6)
 # (deviation in pixels, k, f, bins) of the Gaussians over which means are restored, where the square of a mean exceeds
 # k (1 + (f / N)²) times its variance, N the number of samples that make the noise: a variance from a few bright samples
 # is unknown itself. Without f a shot at 54 dB lost 2 dB to five fireflies; with f no shot at 8 to 512 samples loses
-# 0.1. f / N in place of its square loses more of the light that a thousand samples know.
+# 0.1. f / N in place of its square loses more of the light that a thousand samples measure.
 _MEANS = (48.0, 1.0, 800.0, 1), (12.0, 7.0, 300.0, 1), (48.0, 4.0, 1000.0, 4)
 # Stops of light in a bin: darkness beside bright places has a mean of its own. Noise that is left in a picture
 # correlates its light with the samples: with bins of 2 stops the classical chain loses 0.44 dB of a shot at 8 samples,

@@ -22,7 +22,7 @@ from nlm.relight import relight
 from nlm.samples import average_neighbours
 
 # How much of a frame's noise finished pictures may differ by: up to the first as they are, up to the second without
-# their mean difference (`nlm.relight`), where the light stands still as far as samples tell (`nlm.drift`). The second
+# their mean difference (`nlm.relight`), where the light stands still as far as samples show (`nlm.drift`). The second
 # alone is steadier by 0.2 dB, and averages moving shadows: 2.7 dB of such a shot.
 FINISHED = 0.1, 0.5
 # The same without noise, in tone-mapped units, and by how many times more single pixels may differ: without the second
@@ -35,7 +35,7 @@ DRIFTING_SHARE, DRIFTING = 0.1, (0.6, 0.85)
 # How much more finished pictures lose by a drift than first passes do, whose errors are several times as large: 20 and
 # 100 differ by 0.05 dB, and by 0.25 dB where shadows move.
 DRIFTED = 100
-# Where the light of a frame drifts nearly everywhere, samples tell it only in places, and the rest drifts too: finished
+# Where the light of a frame drifts nearly everywhere, samples show it only in places, and the rest drifts too: finished
 # pictures count in full where two fifths of the picture stand still, and not at all where less than a fifth does. Of
 # nine validation shots one has such light, and gains 0.1 dB; one loses 0.04, the others nothing.
 STANDING = 0.2, 0.4
@@ -79,7 +79,7 @@ def align(
     """Warp all frames of a window to its centre, and measure how far each pixel can be trusted.
 
     With `rows` only these rows of the frame, and `MARGIN` around them. With `ranged` the range of the samples is found
-    while they are averaged; without `guided` nobody reads `AlignedWindow.guide`, but to filter AOVs. All frames have
+    while they are averaged; without `guided` only the filter of AOVs reads `AlignedWindow.guide`. All frames have
     the same layers (`expect_equal_layers`). Raises ValueError if the centre has no first pass and others do.
     """
     timings = timings or Timings()

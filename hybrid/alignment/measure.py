@@ -28,7 +28,7 @@ STILL_NOISE, MOVED_NOISE = 0.05, 1.5
 # Neighbouring half floats differ by at least 2^-11 of their value, and by at most 2^-10: values that differ by less
 # than the first are the same sample, those up to the second are so near by chance.
 SAME, NEAR = 2.0**-12, 2.0**-10
-# Pixels between two of a row at which samples are equal by chance alone; where nearly all are, equal ones tell nothing.
+# Pixels between two of a row at which samples are equal by chance alone; where nearly all are, equal ones mean nothing.
 APART, LEAST_UNEQUAL = 2, 0.02
 # Pixels that differ from their surroundings by less have neither noise nor detail.
 GRAIN = 4 * NEAR
@@ -282,7 +282,7 @@ def _equal_share(a: Array, b: Array, compared: Mask, same: float) -> float:
     distance, greater = np.abs(a - b)[compared], np.maximum(np.abs(a), np.abs(b))[compared]
     equal, near = (np.count_nonzero(distance <= share * greater) for share in (same, max(NEAR, 2 * same)))
     # Noise of a thousandth makes as many halves equal by chance as half of those one step apart; in a fade, where
-    # no step tells, as many as those up to twice as far.
+    # none is one step apart, as many as those up to twice as far.
     return float((equal - (near - equal) / (2 if same == SAME else 1)) / distance.size)
 
 

@@ -215,7 +215,7 @@ def _summarize_input(request: Request, job: Job) -> None:
 
 
 def _summarize_result(request: Request, record: Record, seconds: float) -> None:
-    """Log where the frames are, what they cost, and how to look at them."""
+    """Log where the frames are, what they cost, and how to view them."""
     if made := record.files:
         last = f" to {made[-1].name}" if len(made) > 1 else ""
         summarize("Output", f"{made[0]}{last} ({len(made)} frames)")

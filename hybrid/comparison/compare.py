@@ -175,7 +175,7 @@ def _evaluate(evaluator: Evaluator, methods: Mapping[str, Method], on_step: OnSt
     """Measures of each method; without FLIP for points of a sweep."""
     on_step("FLIP of all methods")
     evaluator.map_flip([name for name, method in methods.items() if not method.sweep])
-    evaluator.map_changes(REFERENCE)  # true changes, beside which flicker can be told
+    evaluator.map_changes(REFERENCE)  # true changes, which are no flicker
     statistics = {}
     for name, method in methods.items():
         on_step(f"measure {name}")

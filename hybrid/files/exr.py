@@ -480,7 +480,7 @@ def write_exr(
     parts = []
     recompressed = source.recompressed(replaced)
     for index, part in enumerate(source.parts):
-        # The binding makes the channel list, and cannot know the type of empty lists.
+        # The binding makes the channel list, and cannot infer the type of empty lists.
         header = {k: v for k, v in part.header.items() if k != "channels" and not (isinstance(v, list) and not v)}
         if index in recompressed:
             header["compression"] = OpenEXR.ZIP_COMPRESSION

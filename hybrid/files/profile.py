@@ -193,7 +193,7 @@ def find_profile(image: ExrImage) -> Profile:
     """Return the profile that fits a file best, with the reason in `why`.
 
     A header attribute counts most, then the names of layers that only one renderer writes. Among equals the profile
-    that knows more of the roles wins, then the user's own.
+    that names more roles wins, then the user's own.
     """
     header = {name: f"{name}={value}" for part in image.parts for name, value in part.header.items()}
     names = {plain_name(tail) for layer in image.layers if (tail := layer.name.rpartition(".")[2])}

@@ -127,7 +127,7 @@ def gather_folder(folder: Path) -> tuple[dict[int, Path], Profile, list[SidecarS
 
 
 def _assign(sequences: Sequence[tuple[str, Pattern]]) -> tuple[Profile, dict[str, list[Pattern]]] | None:
-    """The sequences by role, with the profile that knows most of them; None unless a color and another are known."""
+    """The sequences by role, with the profile that names most of them; None without a color and another one."""
     best: tuple[Profile, dict[str, list[Pattern]]] | None = None
     score = (0, 0)
     for profile in read_profiles().values():
@@ -151,7 +151,7 @@ def _only_each(folder: Path, roles: Mapping[str, Sequence[Pattern]]) -> list[Sid
 
 
 def _profile_of(image: ExrImage, profile: Profile, why: str) -> Profile:
-    """The profile that fits the color's header, or else the one that knows the names."""
+    """The profile that fits the color's header, or else the one that has the names."""
     known = find_profile(image)
     return known if known.name != read_profiles()[COMMON].name else replace(profile, why=why)
 

@@ -61,7 +61,7 @@ class ReadSources:
             return
         status = path.stat()
         changed = (status.st_size, _modified(status.st_mtime_ns)) != (source.size, source.modified)
-        # Some network drives change the inodes of files that nobody has written: then the content decides.
+        # Some network drives change the inodes of unchanged files: then the content decides.
         if not changed and status.st_ino != source.inode:
             self._sources[path] = now = identify(path)
             changed = now != source
