@@ -1,5 +1,7 @@
 """Confidence of warped pixels, and the mix with the centre where confidence is low."""
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numba import njit
@@ -9,8 +11,37 @@ from loops.parallel import run_bands
 
 # Difference of albedo (norm over channels) at which the confidence falls to 1/e.
 _ALBEDO_SIGMA = 0.1
+# Squared difference of unit normals at which the confidence falls to 0: of a cosine of 0.8.
+_NORMAL_LIMIT = np.float32(0.4)
+# How much of the squared difference from a neighbour is subtracted from the variance around a pixel: three times what
+# noise adds to it. Where guides are all noise, as behind a lens, this leaves no outlines.
+_NOISE_IN_VARIANCE = 1.4
+# Least variance of an outline: half floats and textures of a few shades have less.
+_LEAST_VARIANCE = np.float32(1e-4)
+# A difference counts up to this share of the variance when noise is measured, since where another surface is seen it is
+# no noise.
+_LARGEST_SHARE = np.float32(0.5)
+# Measured noise counts up to this: at 8 samples it is 0.05 to 0.15. With 0.15 a shot through a lens, whose guides hold
+# more, loses 0.2 dB at 32 samples.
+NOISE_LIMIT = 0.05
+# Fewest pixels of outlines from which noise is measured.
+_FEWEST = 50
+# A difference of so many times the measured noise is no noise: few pixels have most of it. With 20 and 80 in place of
+# 40 ten shots of 8 samples gain 0.02 dB less and as much.
+_UNLIKELY = 40.0
+# Difference of guides that is no noise: of unit normals that are opposite.
+_LARGEST = np.float32(4)
+# Squared length of a normal on a surface: below a tenth of the samples on one, its direction is that of a stray sample.
+_SURFACE = np.float32(0.01)
 
 _Pair = tuple[np.ndarray, np.ndarray]
+
+
+class GuideNoise(NamedTuple):
+    """Noise of a frame's guides at outlines, where few samples fall on either side by chance."""
+
+    variance: np.ndarray  # (H, W, 2): variance of albedo and normal in 3×3 pixels, from `local_variance`
+    share: tuple[float, float]  # squared difference of two frames, in units of it, from `measure_share`
 
 
 def estimate_confidence(
@@ -23,6 +54,7 @@ def estimate_confidence(
     normal: np.ndarray | None = None,
     other_normal: np.ndarray | None = None,
     first_row: int = 0,
+    noise: GuideNoise | None = None,
 ) -> np.ndarray:
     """Estimate how far a neighbour shows the same as the centre at the end of each vector.
 
@@ -37,6 +69,8 @@ def estimate_confidence(
     first_row : int
         The frame's row that the first row of `flow` belongs to, where the arrays of the centre are some of its rows;
         those of the neighbour are always of the whole frame.
+    noise : GuideNoise, optional
+        Of the centre's guides; None: they have none.
 
     Returns
     -------
@@ -45,14 +79,52 @@ def estimate_confidence(
 
     Notes
     -----
-    inside · [|f + r|² < 0.01 (|f|² + |r|²) + 0.5] · exp(−‖Δa‖² / 0.1²) · clamp((n·n′ − 0.8) / 0.2), then
-    the minimum of 3 x 3 pixels, because the border of an occlusion holds a mix. Δa is divided by the albedo where that
-    is above 1. Shadows and reflections, which move without the geometry, are not detected.
+    inside · [|f + r|² < 0.01 (|f|² + |r|²) + 0.5] · exp(−D(Δa) / 0.1²) · max(1 − D(Δn) / 0.4, 0), then the minimum of
+    3 x 3 pixels, because the border of an occlusion holds a mix. Δa is divided by the albedo where that is above 1, Δn
+    is the difference of unit normals. Shadows and reflections, which move without the geometry, are not detected.
+
+    D(Δ) = max(|Δ|² − 40 s max(V − 1.4 K[|Δ|²], 0), 0), with V the variance of the guide in 3×3 pixels, s the `share` of
+    the noise in it, and K the mean of 3×3 pixels: pixels of an outline differ from frame to frame by their samples. At
+    8 samples that took half of the confidence of textured objects.
 
     References
     ----------
     Sundaram, Brox, Keutzer: Dense point trajectories by GPU-accelerated large displacement optical flow. 2010.
     doi:10.1007/978-3-642-15549-9_32
+    """
+    flow, inside = (np.ascontiguousarray(x, t) for x, t in ((flow, np.float32), (inside, np.bool_)))
+    distance = compare_guides(
+        flow,
+        inside=inside,
+        albedo=albedo,
+        other_albedo=other_albedo,
+        normal=normal,
+        other_normal=other_normal,
+        first_row=first_row,
+    )
+    confidence = np.empty(flow.shape[:2], np.float32)
+    back = np.empty((0, 0, 2), np.float32) if reverse is None else np.ascontiguousarray(reverse, np.float32)
+    share = np.zeros(2, np.float32) if noise is None else np.array(noise.share, np.float32)
+    outlines = outline_variance(noise.variance, distance) if noise is not None and share.any() else distance
+    share *= np.float32(_UNLIKELY)
+    run_bands(_agree, len(confidence), inside, flow, back, distance, outlines, share, first_row, confidence)
+    return cv2.erode(confidence, np.ones((3, 3), np.uint8)).reshape(confidence.shape)
+
+
+def compare_guides(
+    flow: np.ndarray,
+    *,
+    inside: np.ndarray,
+    albedo: np.ndarray | None = None,
+    other_albedo: np.ndarray | None = None,
+    normal: np.ndarray | None = None,
+    other_normal: np.ndarray | None = None,
+    first_row: int = 0,
+) -> np.ndarray:
+    """Squared differences of albedo and of unit normals at the end of each vector, (H, W, 2) float32, at most 4.
+
+    Takes the arrays of `estimate_confidence`. A missing guide differs by 0; where a guide is not finite, or one frame
+    alone has a surface, the difference is 4. Raises ValueError if the shapes do not agree.
     """
     shape = flow.shape[:2]
     if flow.ndim != 3 or flow.shape[2] != 2:
@@ -70,15 +142,63 @@ def estimate_confidence(
                 raise ValueError(f"other_{name} has {len(other)} rows, expected at least {first_row + shape[0]}")
     if inside.shape != shape:
         raise ValueError(f"inside has shape {inside.shape}, expected {shape}")
-
-    confidence = np.empty(shape, np.float32)
     absent = np.empty((0, 0, 0), np.float32)
     layers = [
         tuple(absent if x is None else np.ascontiguousarray(x, np.float32).reshape(*x.shape[:2], -1) for x in pair)
-        for pair in ((flow, reverse), (albedo, other_albedo), (normal, other_normal))
+        for pair in pairs.values()
     ]
-    run_bands(_agree, shape[0], np.ascontiguousarray(inside, np.bool_), *layers, first_row, confidence)
-    return cv2.erode(confidence, np.ones((3, 3), np.uint8)).reshape(shape)
+    distance = np.empty((*shape, 2), np.float32)
+    vectors, covered = np.ascontiguousarray(flow, np.float32), np.ascontiguousarray(inside, np.bool_)
+    run_bands(_compare, shape[0], covered, vectors, *layers, first_row, distance)
+    return distance
+
+
+def local_variance(albedo: np.ndarray | None, normal: np.ndarray | None) -> np.ndarray:
+    """Variance of albedo and of unit normals (H, W, C) in 3×3 pixels, summed over channels, (H, W, 2) float32.
+
+    That of an albedo above 1 is relative, as in `compare_guides`; that of a missing guide is 0. Values that are not
+    finite count as 0. Raises ValueError without any guide.
+    """
+    given = albedo if albedo is not None else normal
+    if given is None:
+        raise ValueError("albedo and normal: expected at least one of them, got none")
+    variance = np.zeros((*given.shape[:2], 2), np.float32)
+    for index, guide in enumerate((albedo, normal)):
+        if guide is None:
+            continue
+        # Squares of more than 1e18 overflow, and an infinity would spoil the filter's running sums.
+        finite = np.clip(np.nan_to_num(np.asarray(guide, np.float32), posinf=0, neginf=0), -1e15, 1e15)
+        means, squares = (cv2.blur(x, (3, 3)).reshape(finite.shape) for x in (finite, finite * finite))
+        spread = np.maximum(squares - means * means, 0).sum(axis=-1)
+        if index == 0:
+            unit = np.square(np.maximum(finite.max(axis=-1), 1))
+        else:
+            unit = np.maximum(np.square(finite).sum(axis=-1), _SURFACE)
+        np.divide(spread, unit, out=variance[..., index])
+    return variance
+
+
+def outline_variance(variance: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Variance (H, W, 2) of outlines: without what the noise makes of it, by the `compare_guides` with a neighbour."""
+    outlines = np.asarray(cv2.blur(distance, (3, 3)), np.float32).reshape(distance.shape)
+    outlines *= np.float32(-_NOISE_IN_VARIANCE)
+    outlines += variance
+    return np.maximum(outlines, 0, out=outlines)
+
+
+def measure_share(outlines: np.ndarray, distance: np.ndarray, inside: np.ndarray) -> tuple[float, float]:
+    """Measure the noise of guides at outlines: squared differences of two frames over the variance, in [0, 0.05].
+
+    Σ min(|Δ|², V / 2) / Σ V over pixels inside (H, W), V their `outline_variance` where it is that of an outline; about
+    1 / N with N samples per pixel. 0 where there are few outlines.
+    """
+    shares = []
+    for spread, difference in zip(np.moveaxis(outlines, -1, 0), np.moveaxis(distance, -1, 0), strict=True):
+        known = inside & (spread > _LEAST_VARIANCE)
+        spread, difference = spread[known], difference[known]
+        share = np.minimum(difference, _LARGEST_SHARE * spread).sum() / spread.sum() if len(spread) > _FEWEST else 0
+        shares.append(min(float(share), NOISE_LIMIT))
+    return shares[0], shares[1]
 
 
 def find_coverage(flow: np.ndarray, valid: np.ndarray, measured: np.ndarray, first_row: int = 0) -> np.ndarray:
@@ -130,26 +250,64 @@ def _fill(first: int, last: int, warped: np.ndarray, centre: np.ndarray, coverag
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _agree(
-    first: int, last: int, inside: np.ndarray, flows: _Pair, albedos: _Pair, normals: _Pair, first_row: int,
+def _compare(
+    first: int, last: int, inside: np.ndarray, flow: np.ndarray, albedos: _Pair, normals: _Pair, first_row: int,
     out: np.ndarray,
 ) -> None:  # fmt: skip
-    """Multiply the agreement of motion, albedo and normal; layers of size 0 are left out."""
-    flow, reverse = flows
+    """Write squared differences of albedo and of unit normals; layers of size 0 are left out."""
     albedo, other_albedo = albedos
     normal, other_normal = normals
-    one = np.float32(1)
+    zero, one = np.float32(0), np.float32(1)
     # All layers of the neighbour have its size, or none.
-    height = max(len(reverse), len(other_albedo), len(other_normal), 1)
+    height = max(len(other_albedo), len(other_normal), 1)
     for y in range(first, last):
         for x in range(out.shape[1]):
-            out[y, x] = 0
+            out[y, x, 0] = out[y, x, 1] = zero
             if not inside[y, x]:
                 continue
             u, v = flow[y, x, 0], flow[y, x, 1]
             place = locate(np.float32(x) + u, np.float32(first_row + y) + v, out.shape[1], height)
             weights = weigh(place)
+            if albedo.size:
+                difference, greatest = zero, one
+                for c in range(albedo.shape[2]):
+                    a, b = albedo[y, x, c], interpolate(other_albedo, c, place, weights)
+                    difference += (a - b) ** 2
+                    greatest = max(greatest, max(a, b))
+                # Relative where the albedo is above 1 (emitters, sky).
+                difference /= greatest * greatest
+                out[y, x, 0] = difference if difference < _LARGEST else _LARGEST  # not where a guide is not finite
+            if normal.size:
+                square, other_square, product = zero, zero, zero
+                for c in range(normal.shape[2]):
+                    a, b = normal[y, x, c], interpolate(other_normal, c, place, weights)
+                    square += a * a
+                    other_square += b * b
+                    product += a * b
+                surface, other_surface = square > _SURFACE, other_square > _SURFACE
+                if surface and other_surface:
+                    bent = np.float32(2) * (one - product / np.sqrt(max(square * other_square, np.float32(1e-4))))
+                    out[y, x, 1] = bent if bent < _LARGEST else _LARGEST
+                elif surface != other_surface or not square + other_square < np.float32(np.inf):
+                    out[y, x, 1] = _LARGEST
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _agree(
+    first: int, last: int, inside: np.ndarray, flow: np.ndarray, reverse: np.ndarray, distance: np.ndarray,
+    outlines: np.ndarray, share: np.ndarray, first_row: int, out: np.ndarray,
+) -> None:  # fmt: skip
+    """Multiply the agreement of motion, albedo and normal; the reverse flow is left out if it has no rows."""
+    zero, one = np.float32(0), np.float32(1)
+    for y in range(first, last):
+        for x in range(out.shape[1]):
+            out[y, x] = zero
+            if not inside[y, x]:
+                continue
             if reverse.size:
+                u, v = flow[y, x, 0], flow[y, x, 1]
+                place = locate(np.float32(x) + u, np.float32(first_row + y) + v, out.shape[1], len(reverse))
+                weights = weigh(place)
                 # Sundaram's test: there and back ends near the start.
                 du, dv = interpolate(reverse, 0, place, weights) + u, interpolate(reverse, 1, place, weights) + v
                 error = np.sqrt(du * du + dv * dv)
@@ -158,31 +316,12 @@ def _agree(
                 bound = np.float32(0.01) * (length**2 + (length + error) ** 2) + np.float32(0.5)
                 if not error**2 < bound:
                     continue
-            weight = one
-            if albedo.size:
-                difference, greatest = np.float32(0), one
-                for c in range(albedo.shape[2]):
-                    a, b = albedo[y, x, c], interpolate(other_albedo, c, place, weights)
-                    difference += (a - b) ** 2
-                    greatest = max(greatest, max(a, b))
-                # Relative where the albedo is above 1 (emitters, sky).
-                weight *= np.exp(-difference / (greatest * greatest * np.float32(_ALBEDO_SIGMA**2)))
-            if normal.size:
-                square, other_square, product = np.float32(0), np.float32(0), np.float32(0)
-                for c in range(normal.shape[2]):
-                    a, b = normal[y, x, c], interpolate(other_normal, c, place, weights)
-                    square += a * a
-                    other_square += b * b
-                    product += a * b
-                # Below a tenth of the samples on a surface, the direction is that of a stray sample.
-                surface, other_surface = square > np.float32(0.01), other_square > np.float32(0.01)
-                if surface and other_surface:
-                    cosine = product / np.sqrt(max(square * other_square, np.float32(1e-4)))
-                    weight *= min(max((cosine - np.float32(0.8)) / np.float32(0.2), np.float32(0)), one)
-                elif surface != other_surface:
-                    continue
-            if weight > 0:  # not where a guide is not finite
-                out[y, x] = weight
+            if max(distance[y, x, 0], distance[y, x, 1]) >= _LARGEST:
+                continue
+            painted = max(distance[y, x, 0] - share[0] * outlines[y, x, 0], zero)
+            bent = max(distance[y, x, 1] - share[1] * outlines[y, x, 1], zero)
+            weight = max(one - bent / _NORMAL_LIMIT, zero)
+            out[y, x] = weight * np.exp(-painted / np.float32(_ALBEDO_SIGMA**2))
 
 
 def mix_centre(

@@ -222,7 +222,10 @@ class FrameStream:
             picture if picture is None or fade == NO_FADE else self.keeper.keep(picture * np.array(fade, np.float32))
             for picture, fade in zip(denoised, fades, strict=True)
         )
-        return Window(frames, links, denoised, plan.stages, repeated, tuple(refined))
+        # Whatever vectors do not explain adds to the noise of a pair.
+        noises = [pair.outline_noise for pair in self.measurements(numbers)[1] if pair.vectors and not pair.cut]
+        noise = (min(n[0] for n in noises), min(n[1] for n in noises)) if noises else (0.0, 0.0)
+        return Window(frames, links, denoised, plan.stages, repeated, tuple(refined), noise)
 
     def _composed(
         self, flows: dict[int, Flow | None], centre: int, before: int, number: int, *, reverse: bool = False

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flow.confidence import fill_uncovered
+from flow.confidence import GuideNoise, fill_uncovered, local_variance
 from flow.warp import warp
 from hybrid.alignment.neighbour import layers_of, novelty_of, trust_geometry, trust_light, warp_layers
 from hybrid.alignment.prepare import ALPHA, PreparedFrame
@@ -271,6 +271,10 @@ def _warp_neighbours(
     kept = {n: np.empty((*shape, layer.shape[-1]), np.float32) for n, layer in layers.items() if n not in guides}
     confidence, coverage = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     trusts: list[Trust | None] = [None] * count
+    with timings.stage("confidence"):
+        noise = None
+        if any(window.outline_noise):
+            noise = GuideNoise(local_variance(layers.get("albedo"), layers.get("normal")), window.outline_noise)
     for index, (there, link) in enumerate(zip(window.frames, window.links, strict=True)):
         if there is None or link is None:
             # The centre itself, or a frame that is missing.
@@ -281,7 +285,7 @@ def _warp_neighbours(
             continue
         with timings.stage("warp"):
             warp_layers(there, link.forward.vectors[rows], rows, {name: layer[index] for name, layer in kept.items()})
-            trust = trusts[index] = trust_geometry(layers, there, link, rows)
+            trust = trusts[index] = trust_geometry(layers, there, link, rows, noise)
             _set_trust(confidence, coverage, window, index, trust, rows)
     return _Warped(kept, confidence, tuple(trusts)), coverage
 

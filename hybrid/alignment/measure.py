@@ -7,6 +7,7 @@ from typing import Self
 import cv2
 import numpy as np
 
+from flow.confidence import compare_guides, find_coverage, local_variance, measure_share, outline_variance
 from flow.guide import tone_map
 from flow.tvl1 import rough_flow
 from flow.warp import warp
@@ -37,6 +38,8 @@ GRAIN = 4 * NEAR
 GUIDE_CHANGE = 0.02
 # Every so many rows are looked at for noise of a frame: all take a tenth of a second at 1920×1080.
 GRAIN_ROWS = 16
+# Rows that are compared together for noise of guides at outlines, of `SmallFrame.factor` times as many.
+OUTLINE_ROWS = 16
 # Areas whose means show changes that noise hides in 9×9 pixels: they must differ by more than a twentieth, and by eight
 # standard errors, as samples that a pixel filter spreads are alike in several pixels.
 AREA, AREA_CHANGE, AREA_NOISE = 32, 0.05, 8.0
@@ -106,6 +109,8 @@ class PairFacts:
     # share of the noise that is fixed to the screen, in [-1, 1]: about 1 with one seed for all frames, else 0
     fixed_noise: float
     guide_noise: float  # upper quartile of the difference of albedo and normal between the frames, along the vectors
+    # share of the noise of albedo and normals in their variance at outlines (`flow.confidence.measure_share`)
+    outline_noise: tuple[float, float] = (0.0, 0.0)
     cut: bool = False  # whether the frames are of different scenes, so that they must not be averaged
     repeated: bool = False  # whether the later frame repeats the earlier one, and has no samples of its own
     # factor of each channel from the earlier frame to the later, where they explain most of the change; else 1
@@ -197,6 +202,7 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
         unexplained=max(unexplained, _changed_areas(*smalls, reduced)),
         fixed_noise=0.0 if free else fixed_noise(here, lit, moves=changed > 0, same=same),
         guide_noise=_guide_noise(here, there, vectors, smalls[0].factor),
+        outline_noise=_outline_noise(here, there, vectors, smalls[0].factor),
         cut=cut,
         repeated=equal and not free,
         fade=NO_FADE if cut else fade,
@@ -526,6 +532,30 @@ def _guide_noise(here: PreparedFrame, there: PreparedFrame, vectors: tuple[Array
         warped = other[grid] if vectors is None else _warp_block(other, vectors[0], grid)
         differences += [*np.moveaxis(np.abs(guide[grid] - warped), -1, 0)]
     return float(np.quantile(np.maximum.reduce(differences), 0.75)) if differences else 0.0
+
+
+def _outline_noise(
+    here: PreparedFrame, there: PreparedFrame, vectors: tuple[Array, Mask] | None, factor: int
+) -> tuple[float, float]:
+    """Share of the noise of albedo and normals at outlines, in one of `factor` bands of rows; 0 without vectors."""
+    both = {
+        name: (guide, other)
+        for name, guide, other in (("albedo", here.albedo, there.albedo), ("normal", here.normal, there.normal))
+        if guide is not None and other is not None
+    }
+    if vectors is None or not both:
+        return 0.0, 0.0
+    others = {f"other_{name}": other for name, (_, other) in both.items()}
+    found: list[tuple[Array, Array, Mask]] = []
+    for top in range(0, len(here.valid), factor * OUTLINE_ROWS):
+        rows = slice(top, top + OUTLINE_ROWS)
+        guides = {name: guide[rows] for name, (guide, _) in both.items()}
+        flow, valid = (layer[rows] for layer in vectors)
+        inside = find_coverage(flow, valid, there.valid, top)
+        distance = compare_guides(flow, inside=inside, **guides, **others, first_row=top)
+        outlines = outline_variance(local_variance(guides.get("albedo"), guides.get("normal")), distance)
+        found.append((outlines, distance, inside))
+    return measure_share(*(np.concatenate(layers) for layers in zip(*found, strict=True)))
 
 
 def _guide_grain(guides: Sequence[Array]) -> float | None:

@@ -5,7 +5,7 @@ from collections.abc import Collection
 import numpy as np
 from numba import njit
 
-from flow.confidence import estimate_confidence, find_coverage
+from flow.confidence import GuideNoise, estimate_confidence, find_coverage
 from flow.warp import warp
 from hybrid.alignment.flows import Link
 from hybrid.alignment.prepare import ALPHA, PreparedFrame
@@ -46,8 +46,13 @@ def warp_layers(there: PreparedFrame, flow: Array, rows: slice, warped: dict[str
             out[...] = layers[name][rows]
 
 
-def trust_geometry(centre: dict[str, Array], there: PreparedFrame, link: Link, rows: slice) -> Trust:
-    """Measure how far geometry trusts a neighbour at some rows of the centre, whose layers are `centre`."""
+def trust_geometry(
+    centre: dict[str, Array], there: PreparedFrame, link: Link, rows: slice, noise: GuideNoise | None
+) -> Trust:
+    """Measure how far geometry trusts a neighbour at some rows of the centre, whose layers are `centre`.
+
+    `noise` is that of the centre's guides; None: they have none.
+    """
     flow = link.forward.vectors[rows]
     covered = find_coverage(flow, link.forward.valid[rows], there.valid, rows.start)
     confidence = estimate_confidence(
@@ -59,6 +64,7 @@ def trust_geometry(centre: dict[str, Array], there: PreparedFrame, link: Link, r
         normal=centre.get("normal"),
         other_normal=there.normal,
         first_row=rows.start,
+        noise=noise,
     )
     return Trust(covered, confidence)
 

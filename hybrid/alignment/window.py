@@ -34,6 +34,7 @@ class Window:
     repeated: tuple[bool, ...]  # whether a frame has the samples of the frame beside it on the side of the centre
     # the shares of the picture on which TV-L1 corrected vectors, for all flows within the window
     refined: tuple[float, ...] = ()
+    outline_noise: tuple[float, float] = (0.0, 0.0)  # the least of `measure.PairFacts` within the window
     limited: tuple[Limited | None, ...] = ()  # what the limit of residuals takes from each frame with a first pass
 
     @property

@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
-from flow.confidence import estimate_confidence, find_coverage, mix_centre
+from flow.confidence import (
+    NOISE_LIMIT,
+    GuideNoise,
+    compare_guides,
+    estimate_confidence,
+    find_coverage,
+    local_variance,
+    measure_share,
+    mix_centre,
+    outline_variance,
+)
 from flow.warp import warp
 
 SHAPE = (16, 20)
@@ -140,3 +152,76 @@ def test_coverage_needs_a_valid_vector_into_the_frame_and_four_measured_pixels()
     expected = INSIDE.copy()
     expected[2, 3] = expected[9, 8] = expected[9, 9] = expected[14, 5] = False
     np.testing.assert_array_equal(find_coverage(flow[rows], valid[rows], measured, rows.start), expected[rows])
+
+
+def sampled(samples: int, seed: int, objects: slice = slice(8, 40)) -> dict[str, np.ndarray]:
+    """Albedo and normals of a striped object on a plane, a few samples in each pixel."""
+    rng = np.random.default_rng(seed)
+    y, x = (places[..., None] + rng.random((64, 64, samples)) for places in np.mgrid[:64, :64].astype(np.float64))
+    inside = (x > objects.start + 0.4) & (x < objects.stop + 0.3)
+    stripe = inside & ((0.3 * x + y) % 5 < 2.5)
+    albedo = np.where(stripe, 0.8, np.where(inside, 0.2, 0.5)).mean(-1)[..., None] * np.ones(3)
+    normal = np.stack([np.where(inside, -0.6, 0), np.zeros_like(x), np.where(inside, 0.8, 1)], -1).mean(-2)
+    return {"albedo": albedo.astype(np.float32), "normal": normal.astype(np.float32)}
+
+
+def pair(here: dict[str, np.ndarray], there: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    still, inside = np.zeros((64, 64, 2), np.float32), np.ones((64, 64), bool)
+    return {"flow": still, "inside": inside, **here, **{f"other_{name}": guide for name, guide in there.items()}}
+
+
+def noise_of(here: dict[str, np.ndarray], there: dict[str, np.ndarray]) -> GuideNoise:
+    arrays = pair(here, there)
+    distance, variance = compare_guides(**arrays), local_variance(**here)
+    return GuideNoise(variance, measure_share(outline_variance(variance, distance), distance, arrays["inside"]))
+
+
+def test_outlines_of_few_samples_are_trusted_and_another_surface_is_not() -> None:
+    """Samples fall on either side of an outline by chance: textured objects had half of their confidence."""
+    here, there, moved = sampled(8, 1), sampled(8, 2), sampled(8, 3, objects=slice(14, 46))
+    noise = noise_of(here, there)
+    assert max(noise.share) == NOISE_LIMIT
+    strict, lenient = (estimate_confidence(**pair(here, there), noise=n) for n in (None, noise))
+    assert strict[:, 8:40].mean() < 0.3
+    assert lenient[:, 8:40].mean() > 0.9
+    occluded = estimate_confidence(**pair(here, moved), noise=noise)
+    assert occluded[:, 11:14].max() < 0.01  # the object in one frame, the plane in the other
+    assert occluded[:, 42:45].max() < 0.01
+
+
+def test_noise_at_outlines_falls_with_the_samples() -> None:
+    shares = [noise_of(sampled(n, 1), sampled(n, 2)).share for n in (32, 128, 512)]
+    for few, many in pairwise(shares):
+        np.testing.assert_allclose(np.divide(few, many), 4, rtol=0.4)
+    assert noise_of(sampled(512, 1), sampled(512, 1)).share == (0, 0)
+
+
+def test_noise_everywhere_makes_no_outlines() -> None:
+    """As behind a lens: there geometry has to be strict, since vectors are averages over what a pixel shows."""
+    rng = np.random.default_rng(0)
+    here, there = ({"albedo": rng.normal(0.5, 0.1, (64, 64, 3)).astype(np.float32)} for _ in range(2))
+    variance = local_variance(here["albedo"], None)
+    outlines = outline_variance(variance, compare_guides(**pair(here, there)))
+    assert outlines.mean() < 0.02 * variance[..., 0].mean()
+
+
+def test_noise_forgives_no_guide_that_is_not_finite() -> None:
+    here, there = sampled(8, 1), sampled(8, 2)
+    noise = noise_of(here, there)
+    for name, value in (("albedo", np.nan), ("normal", np.inf)):
+        for guides in (here, there):
+            kept = guides[name].copy()
+            guides[name][30, 30] = value
+            confidence = estimate_confidence(**pair(here, there), noise=noise)
+            assert not confidence[29:32, 29:32].any()
+            assert np.isfinite(confidence).all()
+            assert np.isfinite(local_variance(**here)).all()
+            guides[name][:] = kept
+
+
+def test_a_missing_guide_has_no_noise() -> None:
+    variance = local_variance(None, sampled(8, 1)["normal"])
+    assert not variance[..., 0].any()
+    assert variance[..., 1].any()
+    with pytest.raises(ValueError, match="albedo and normal"):
+        local_variance(None, None)
