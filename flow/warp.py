@@ -11,6 +11,10 @@ from loops.parallel import run_bands
 Four = tuple[Any, Any, Any, Any]
 
 
+# Part of a pixel beyond a whole one from which on a sample is one between pixels: sharp outlines are blurred there.
+_BETWEEN = np.float32(1 / 8)
+
+
 class Place(NamedTuple):
     """Whether a position is in the frame, its four pixels, and its fractions from the first pixel (x0, y0)."""
 
@@ -40,6 +44,19 @@ def locate(px: np.float32, py: np.float32, width: int, height: int) -> Place:
     x1 = x0 + 1 if fx > 0 else x0
     y1 = y0 + 1 if fy > 0 else y0
     return Place(inside, x0, y0, x1, y1, fx, fy)
+
+
+@njit(nogil=True)
+def weigh_whole(place: Place) -> np.float32:
+    """Weight of a position by its distance from a whole pixel: 1 there, 0 from an eighth of a pixel on."""
+    zero, one = np.float32(0), np.float32(1)
+    return max(one - max(min(place.fx, one - place.fx), min(place.fy, one - place.fy)) / _BETWEEN, zero)
+
+
+def at_whole_pixels(flow: np.ndarray) -> np.ndarray:
+    """Where a finite flow (H, W, 2) ends near a whole pixel: (H, W) bool."""
+    near: np.ndarray = np.abs(flow - np.round(flow)).max(axis=-1) < _BETWEEN / 2
+    return near
 
 
 @njit(nogil=True)

@@ -136,7 +136,9 @@ def denoise_arrays(
         prepare_process(chosen)
         denoiser = open_denoiser(chosen)
         source = choose_first_pass(cast("Shot", shot), chosen, denoiser)
-        stream = FrameStream(shot, chosen.rules, source.first_pass, radius=denoiser.radius)
+        stream = FrameStream(
+            shot, chosen.rules, source.first_pass, radius=denoiser.radius, filter_guides=denoiser.filter_guides
+        )
         denoise = FrameDenoiser(stream, denoiser)
         for number in wanted:
             made = denoise.make(number)

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
+from hybrid.alignment.guides import GuideFilter
 from hybrid.alignment.window import AlignedWindow
 from hybrid.first_pass import Backends
 from hybrid.pseudo_reference import ClassicalPreset, filter_window, gated_average, pool_and_denoise
@@ -19,6 +20,11 @@ class WindowDenoiser(Protocol):
     guided: bool = True  # whether `AlignedWindow.guide` or its confidence by geometry is read where there are no AOVs
     pools: ClassVar[bool] = False  # whether samples of the window are pooled and denoised by OIDN
     packages: ClassVar[tuple[str, ...]] = ()  # packages that pixels depend on
+
+    @property
+    def filter_guides(self) -> GuideFilter | None:
+        """Function that filters a frame's albedo and normal, for networks that need them without noise."""
+        return None
 
     @property
     def radius(self) -> int:

@@ -493,6 +493,7 @@ class Job:
             radius=self.denoiser.radius,
             network=self.denoiser.memory,
             pools=self.denoiser.pools,
+            filters_guides=self.denoiser.filter_guides is not None,
         )
 
     def margins(self) -> list[int]:

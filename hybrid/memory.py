@@ -30,6 +30,8 @@ SHARE = 0.94
 FILTERING, ALIGNING, GIVING, FINISHING = 40, 24, 20, 38
 # Planes that exist while pairs of frames are compared before a run: 4.9 GiB at 7680×4320, while the second is read.
 VALIDATING = 38
+# Temporary planes while OIDN's networks filter the guides of a frame, in float32: 50 at 1920×1080.
+CLEANING = 60
 # Temporary planes while TV-L1 solves for a flow.
 REFINING = 38
 _UNITS = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
@@ -61,19 +63,22 @@ def plan_memory(
     radius: int = 2,
     network: Callable[[tuple[int, int]], int | None] = lambda _: None,
     pools: bool = False,
+    filters_guides: bool = False,
 ) -> MemoryPlan:
     """Plan a run: whole frames in memory if they fit, else with what is kept in files, and as many rows as then fit.
 
     The result is the same for the same arguments, on every machine. `stages` are those that may run on some frame,
     `network` maps height and width to the bytes that a network takes while it runs; with `pools` samples are pooled and
-    denoised by OIDN. Raises ValueError, with what is needed, if not even the fewest rows fit.
+    denoised by OIDN; with `filters_guides` the guides of frames are filtered for a network. Raises ValueError, with
+    what is needed, if not even the fewest rows fit.
 
     Counted in planes of one float32 a pixel: planes kept for a window, and the most that exist at once while a frame is
     prepared, finished or worked on. `tests/reliability/test_memory.py` measures the true peak.
     """
     height, width = shot.shape
     layers, neural = shot.layers(shot.numbers[0]), network(shot.shape) is not None
-    kept = kept_planes(shot, stages, first_pass, radius)
+    kept = kept_planes(shot, stages, first_pass, radius, filters_guides=filters_guides)
+    filters_guides &= "clean-guides" in stages
     # The frame as read, with the file that it is read from, or with what is prepared of it.
     prepared = prepared_planes(layers)
     reading = prepared + max(len(shot.header(shot.numbers[0]).channel_names), prepared)
@@ -97,7 +102,8 @@ def plan_memory(
         working = max(plane * worked * share + (network((outer, width)) or 0), plane * aligned * share) + plane * read
         # A first pass is made while frames are prepared; pooled samples are denoised while rows are worked on.
         working += oidn if pools else min(oidn, CODE)
-        at_once = max(plane * passing + oidn, plane * FINISHING, working)
+        cleaning = CLEANING if filters_guides else 0
+        at_once = max(plane * passing + oidn, plane * cleaning, plane * FINISHING, working)
         return base + round(max(plane * held + at_once, plane * VALIDATING))
 
     budget = round(SHARE * limit)

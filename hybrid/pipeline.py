@@ -172,7 +172,15 @@ class _ShotDenoiser:
         self.readers = [Prefetcher(view.shot, thread, timings) for view in views]
         self.denoisers, keeper = [], Keeper(in_files=settings.in_files)
         for reader, view in zip(self.readers, views, strict=True):
-            stream = FrameStream(reader, rules, view.first_pass, radius=radius, timings=timings, keeper=keeper)
+            stream = FrameStream(
+                reader,
+                rules,
+                view.first_pass,
+                radius=radius,
+                filter_guides=getattr(denoise, "filter_guides", None),  # a denoiser may be a plain function
+                timings=timings,
+                keeper=keeper,
+            )
             self.denoisers.append(FrameDenoiser(stream, denoise, rows=settings.rows, keep_going=settings.keep_going))
 
     def make(self, number: int, path: Path, following: int | None) -> Finished | Callable[[], Finished]:

@@ -15,6 +15,7 @@ from flow.tvl1 import refine_flow
 from hybrid.alignment.align import align, expect_equal_layers
 from hybrid.alignment.fireflies import REACH, remove_fireflies
 from hybrid.alignment.flows import Flow, Link, PairFlows, compose_flows, measure_flows
+from hybrid.alignment.guides import GuideFilter
 from hybrid.alignment.measure import (
     NO_FADE,
     Fade,
@@ -23,6 +24,7 @@ from hybrid.alignment.measure import (
     SmallFrame,
     fixed_noise,
     inverse,
+    least_outline_noise,
     measure_frame,
     measure_pair,
     relit,
@@ -65,7 +67,10 @@ class FirstPass:
 
 
 class FrameStream:
-    """The frames of a shot, read lazily, and what is made of each; `radius` of windows, `refine` as `refine_flow`."""
+    """The frames of a shot, read lazily, and what is made of each; `radius` of windows, `refine` as `refine_flow`.
+
+    `filter_guides` maps a frame's albedo and normal to the same without noise, for denoisers that need them.
+    """
 
     def __init__(
         self,
@@ -75,6 +80,7 @@ class FrameStream:
         *,
         radius: int = RADIUS,
         refine: Callable[..., Array] = refine_flow,
+        filter_guides: GuideFilter | None = None,
         timings: Timings | None = None,
         keeper: Keeper | None = None,
     ) -> None:
@@ -84,7 +90,7 @@ class FrameStream:
         self.radius = radius
         self.timings = timings or Timings()
         self.keeper = keeper or Keeper()
-        self._refine = refine
+        self._refine, self._filter_guides = refine, filter_guides
         # Kind of a value and the frames it belongs to → the value.
         self._cache: dict[tuple[str, tuple[int, ...]], object] = {}
 
@@ -170,7 +176,7 @@ class FrameStream:
             return window
         found = [(self._limited(n), np.mean(self._fade(n, number, window.stages), dtype=np.float32)) for n in numbers]
         limited = (part and part._replace(exposure=part.exposure * fade) for part, fade in found)
-        return replace(window, limited=tuple(limited))
+        return replace(window, limited=tuple(limited), filtered_guides=self._filtered(numbers, window.stages))
 
     def window_of_results(self, number: int, results: dict[int, Array]) -> Window:
         """The window of a frame and its two neighbours, with these results (H, W, 3) in the place of a first pass."""
@@ -222,9 +228,7 @@ class FrameStream:
             picture if picture is None or fade == NO_FADE else self.keeper.keep(picture * np.array(fade, np.float32))
             for picture, fade in zip(denoised, fades, strict=True)
         )
-        # Whatever vectors do not explain adds to the noise of a pair.
-        noises = [pair.outline_noise for pair in self.measurements(numbers)[1] if pair.vectors and not pair.cut]
-        noise = (min(n[0] for n in noises), min(n[1] for n in noises)) if noises else (0.0, 0.0)
+        noise = least_outline_noise(self.measurements(numbers)[1])
         return Window(frames, links, denoised, plan.stages, repeated, tuple(refined), noise)
 
     def _composed(
@@ -304,6 +308,22 @@ class FrameStream:
 
         return self._cached("pair facts", (a, b), measure)
 
+    def _filtered(self, numbers: Sequence[int], stages: Collection[str]) -> tuple[dict[str, Array] | None, ...] | None:
+        """The filtered guides of frames, (H, W, 3) in half precision; None without the stage, or the filter."""
+        run = self._filter_guides
+        if run is None or "clean-guides" not in stages:
+            return None
+
+        def make(number: int) -> dict[str, Array] | None:
+            frame = self.frame(number)
+            given = {} if frame is None else {"albedo": frame.albedo, "normal": frame.normal}
+            guides = {name: guide for name, guide in given.items() if guide is not None}
+            with self.timings.stage("clean-guides"):
+                return {n: g.astype(np.float16) for n, g in run(guides).items()} if guides else None
+
+        found = tuple(self._cached("filtered guides", (n,), make) for n in numbers)
+        return None if found[len(found) // 2] is None else found
+
     def _limited(self, number: int) -> Limited | None:
         """The light that the limit of residuals takes from a frame; None if that is little, or without a first pass."""
         frame, denoised = self.frame(number), self.denoised(number)
@@ -349,9 +369,13 @@ class FrameStream:
         return frame
 
 
-def kept_planes(shot: Shot, stages: Collection[str], first_pass: FirstPass | None, radius: int) -> float:
+def kept_planes(
+    shot: Shot, stages: Collection[str], first_pass: FirstPass | None, radius: int, *, filters_guides: bool = False
+) -> float:
     """Count the float32 planes that are kept while windows slide: frames, flows and results."""
     layers = shot.layers(shot.numbers[0])
+    guides = 1.5 * ((layers.albedo is not None) + (layers.normal is not None))  # in half precision
+    filtered = guides if filters_guides and "clean-guides" in stages else 0.0
     support = radius if first_pass is None else first_pass.reach(radius)
     # Fireflies are looked for in frames beyond the window.
     frames = min(2 * support + 1 + (REACH if "fireflies" in stages else 0), len(shot.files))
@@ -359,7 +383,7 @@ def kept_planes(shot: Shot, stages: Collection[str], first_pass: FirstPass | Non
     # With the neighbours' samples, trust, drift and excess; of a third result the color is left.
     written = 3 + sum(len(layer.channels) for layer in layers.aovs.values()) + (layers.alpha is not None) + 10
     pictures = results * written + 4 * (results - 1)
-    return frames * prepared_planes(layers) + _flow_planes(layers, stages, frames, radius) + pictures
+    return frames * (prepared_planes(layers) + filtered) + _flow_planes(layers, stages, frames, radius) + pictures
 
 
 def _flow_planes(layers: Layers, stages: Collection[str], frames: int, radius: int) -> float:

@@ -7,6 +7,7 @@ import numpy as np
 
 from flow.confidence import GuideNoise, fill_uncovered, local_variance
 from flow.warp import warp
+from hybrid.alignment.guides import average_guides
 from hybrid.alignment.neighbour import layers_of, novelty_of, trust_geometry, trust_light, warp_layers
 from hybrid.alignment.prepare import ALPHA, PreparedFrame
 from hybrid.alignment.transfer import demodulate, remodulate
@@ -96,6 +97,9 @@ def align(
     with timings.stage("confidence"):
         # Before the first pass is warped, whose place in memory the guide of all frames has until then.
         clean = clean_guide("albedo", guides, sources, warped.confidence, stages) if "albedo" in guides else None
+        filtered = None
+        if window.filtered_guides is not None:
+            filtered = average_guides(window.filtered_guides, flows, warped.confidence, padded)
     estimates = None
     if window.first_pass is not None:
         estimates = _warp_first_pass(window, window.first_pass, coverage, padded, timings)
@@ -169,6 +173,7 @@ def align(
         # A copy: a view would keep the weights of all frames in memory.
         drift_weight=None if weight is None or not _shows_drift(window) else weight[middle + 1].copy(),
         passes=centre.passes,
+        filtered_guides=filtered,
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from flow.confidence import compare_guides, find_coverage, local_variance, measure_share, outline_variance
 from flow.guide import tone_map
 from flow.tvl1 import rough_flow
-from flow.warp import warp
+from flow.warp import at_whole_pixels, warp
 from hybrid.alignment.prepare import PreparedFrame, rendered_flow, rough_light
 from hybrid.alignment.transfer import ALBEDO_FLOOR, NO_LIGHT, compress, measure_exposure, remodulate
 from hybrid.files.frame import Array
@@ -534,10 +534,22 @@ def _guide_noise(here: PreparedFrame, there: PreparedFrame, vectors: tuple[Array
     return float(np.quantile(np.maximum.reduce(differences), 0.75)) if differences else 0.0
 
 
+def least_outline_noise(pairs: Sequence[PairFacts]) -> tuple[float, float]:
+    """Return the least noise of albedo and of normals at outlines, as what vectors do not explain adds to it.
+
+    0 without vectors.
+    """
+    noises = [pair.outline_noise for pair in pairs if pair.vectors and not pair.cut]
+    return (min(n[0] for n in noises), min(n[1] for n in noises)) if noises else (0.0, 0.0)
+
+
 def _outline_noise(
     here: PreparedFrame, there: PreparedFrame, vectors: tuple[Array, Mask] | None, factor: int
 ) -> tuple[float, float]:
-    """Share of the noise of albedo and normals at outlines, in one of `factor` bands of rows; 0 without vectors."""
+    """Share of the noise of albedo and normals at outlines that move by whole pixels, in one of `factor` bands of rows.
+
+    0 without vectors.
+    """
     both = {
         name: (guide, other)
         for name, guide, other in (("albedo", here.albedo, there.albedo), ("normal", here.normal, there.normal))
@@ -551,7 +563,7 @@ def _outline_noise(
         rows = slice(top, top + OUTLINE_ROWS)
         guides = {name: guide[rows] for name, (guide, _) in both.items()}
         flow, valid = (layer[rows] for layer in vectors)
-        inside = find_coverage(flow, valid, there.valid, top)
+        inside = find_coverage(flow, valid, there.valid, top) & at_whole_pixels(flow)
         distance = compare_guides(flow, inside=inside, **guides, **others, first_row=top)
         outlines = outline_variance(local_variance(guides.get("albedo"), guides.get("normal")), distance)
         found.append((outlines, distance, inside))

@@ -35,6 +35,8 @@ class Window:
     # the shares of the picture on which TV-L1 corrected vectors, for all flows within the window
     refined: tuple[float, ...] = ()
     outline_noise: tuple[float, float] = (0.0, 0.0)  # the least of `measure.PairFacts` within the window
+    # (H, W, 3): albedo and normal of each frame without noise; None where no network needs them
+    filtered_guides: tuple[Mapping[str, Array] | None, ...] | None = None
     limited: tuple[Limited | None, ...] = ()  # what the limit of residuals takes from each frame with a first pass
 
     @property
@@ -158,6 +160,7 @@ class AlignedWindow:
     drift_weight: Array | None = None
     known_range: SampleRange | None = None  # `sample_range`, where it was found along the way
     passes: Passes = NO_PASSES  # the relation of `aovs` to the color
+    filtered_guides: dict[str, Array] | None = None  # (H, W, 3): `guides` without noise, as `Window.filtered_guides`
 
     @cached_property
     def color(self) -> Array:

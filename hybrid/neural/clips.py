@@ -13,6 +13,7 @@ from hybrid.alignment.window import AlignedWindow
 from hybrid.files.shots import Shot
 from hybrid.first_pass import OIDN_MODES, find_first_pass
 from hybrid.neural.network_denoiser import exposure_of
+from hybrid.neural.oidn_networks import has_oidn_networks, prefilter_guides
 from hybrid.neural.tiling import tensor_of
 from hybrid.neural.unet_denoiser import clean_guides, gain_of
 from hybrid.plan import Rules
@@ -65,8 +66,9 @@ def write_clips(
     shots, numbers = list(source.levels.values()), source.numbers()
     rendered = [*shots, *([] if source.target is None else [source.target])]
     first_passes = [find_first_pass(estimate, shot) for shot in rendered]
+    filter_guides = prefilter_guides if has_oidn_networks() else None
     streams = [
-        FrameStream(shot, Rules(), first_pass.first_pass, radius=radius)
+        FrameStream(shot, Rules(), first_pass.first_pass, radius=radius, filter_guides=filter_guides)
         for shot, first_pass in zip(rendered, first_passes, strict=True)
     ]
     # OIDN, if it makes the first passes, is there to denoise the pooled samples too.

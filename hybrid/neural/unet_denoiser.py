@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from hybrid.alignment.guides import GuideFilter
 from hybrid.alignment.transfer import measure_exposure, measure_gain
 from hybrid.alignment.window import AlignedWindow
 from hybrid.files.frame import Array
@@ -32,6 +33,10 @@ class UNetDenoiser(NetworkDenoiser):
     def __init__(self, model: RobustUNet, setup: Setup) -> None:
         super().__init__(for_inference(model, setup.bfloat16), setup, SCRATCH[model.config.size])
         self.guided = setup.breakdown is not None or (model.config.clean_guides and not has_oidn_networks())
+
+    @property
+    def filter_guides(self) -> GuideFilter | None:
+        return prefilter_guides if self.model.config.clean_guides and has_oidn_networks() else None
 
     def __call__(self, aligned: AlignedWindow) -> Denoised:
         if aligned.first_pass is None or aligned.centre_first_pass is None:
@@ -84,11 +89,9 @@ def _residual_rows(aligned: AlignedWindow, outer: Block, rows: slice) -> Array:
 def clean_guides(aligned: AlignedWindow) -> dict[str, Array]:
     """The centre's albedo and normal, denoised where the plan has found noise: in training and in running."""
     guides = aligned.guides
-    if "prefilter" not in aligned.stages or not guides:
-        return guides
-    if has_oidn_networks():
-        return prefilter_guides(guides)
-    if aligned.guide is None:
+    if aligned.filtered_guides is not None:
+        return aligned.filtered_guides
+    if "prefilter" not in aligned.stages or not guides or has_oidn_networks() or aligned.guide is None:
         return guides
     # The filtered guide of the window is less accurate where guides are very noisy.
     return dict(zip(guides, np.split(aligned.guide, len(guides), axis=-1), strict=True))

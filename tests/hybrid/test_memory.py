@@ -49,7 +49,8 @@ def shot_of(folder, alpha=1.0):
     return open_shot(SCENE.write(folder, edit=cover))
 
 
-def test_no_more_is_held_than_memory_is_planned_for(tmp_path):
+@pytest.mark.parametrize("filters_guides", [False, True])
+def test_no_more_is_held_than_memory_is_planned_for(tmp_path, filters_guides):
     """The greatest part of memory: `--max-memory` trusts the owner's own count of it."""
     shot, held = shot_of(tmp_path), []
 
@@ -57,10 +58,12 @@ def test_no_more_is_held_than_memory_is_planned_for(tmp_path):
         held.append(planes((maker.stream._cache, maker._results)))
         return Denoised(aligned.centre_irradiance * aligned.modulation)
 
-    maker = FrameDenoiser(FrameStream(shot, Rules(), FIRST_PASS), denoise)
+    rules = Rules(on=frozenset({"clean-guides"}))
+    filter_guides = {"filter_guides": dict} if filters_guides else {}
+    maker = FrameDenoiser(FrameStream(shot, rules, FIRST_PASS, **filter_guides), denoise)
     for number in range(MIDDLE - 1, MIDDLE + 2):
         maker.make(number)
-    declared = kept_planes(shot, Rules().allowed, FIRST_PASS, 2)
+    declared = kept_planes(shot, Rules().allowed, FIRST_PASS, 2, filters_guides=filters_guides)
     assert max(held) <= declared
 
 

@@ -107,7 +107,29 @@ def test_noise_in_the_guides_calls_for_prefiltering(tmp_path):
         layers["ViewLayer.Denoising Albedo"] += noise.astype(np.float32)
 
     assert not decisions(Scene().write(tmp_path / "sharp"))["prefilter"].on
-    assert decisions(Scene().write(tmp_path / "noisy", edit=blur))["prefilter"].on
+    found = decisions(Scene().write(tmp_path / "noisy", edit=blur))
+    assert found["prefilter"].on
+    assert found["clean-guides"].on
+
+
+def test_noise_at_outlines_calls_for_guides_without_it(tmp_path):
+    """Few pixels have it, so that the quartile which calls for prefiltering does not show it."""
+
+    def mix(samples):
+        def edit(index, layers):
+            albedo = layers["ViewLayer.Denoising Albedo"]
+            column = np.indices(albedo.shape[:2])[1][..., None] % 14
+            mixed = np.random.default_rng(index).binomial(samples, 0.5, albedo.shape[:2])[..., None] / samples
+            albedo[:] = np.where(column == 6, 0.2 + 0.6 * mixed, np.where(column < 6, 0.2, 0.8))
+
+        return edit
+
+    scene = Scene(step=(0, 0))
+    few, many = (decisions(scene.write(tmp_path / str(n), edit=mix(n)))["clean-guides"] for n in (8, 512))
+    assert few.on
+    assert few.figure > 10 * many.figure > 0
+    assert not many.on
+    assert not decisions(scene.write(tmp_path / "8"))["prefilter"].on
 
 
 @pytest.mark.parametrize(("frames", "noise", "filtered"), [(1, 0.1, True), (3, 1.5, True), (3, 0.1, False)])

@@ -1,11 +1,12 @@
 """Windows on their way to the final stage: guides, and frames without light."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from tests.scenes import Scene, only
+from tests.scenes import Scene, denoise_view, only
 
 torch = pytest.importorskip("torch")
 
@@ -15,7 +16,7 @@ from hybrid.first_pass import Classical  # noqa: E402
 from hybrid.neural import open_network, unet_denoiser  # noqa: E402
 from hybrid.neural.unet_denoiser import clean_guides  # noqa: E402
 from hybrid.pseudo_reference import DRAFT  # noqa: E402
-from hybrid.stabilize import FrameDenoiser  # noqa: E402
+from hybrid.stabilize import Denoised, FrameDenoiser  # noqa: E402
 from hybrid.stream import FrameStream  # noqa: E402
 from network.checkpoint import shipped_weights  # noqa: E402
 
@@ -47,10 +48,35 @@ def test_guides_are_cleaned_where_they_have_noise(tmp_path, monkeypatch):
     monkeypatch.setattr(unet_denoiser, "has_oidn_networks", lambda: False)
     ours = clean_guides(noisy)
     np.testing.assert_array_equal(np.concatenate(list(ours.values()), axis=-1), noisy.guide)
-    monkeypatch.setattr(unet_denoiser, "has_oidn_networks", lambda: True)
-    monkeypatch.setattr(unet_denoiser, "prefilter_guides", lambda guides: {name: -guides[name] for name in guides})
-    for name, guide in clean_guides(noisy).items():
-        np.testing.assert_array_equal(guide, -noisy.guides[name])
+    filtered = {name: -guide for name, guide in noisy.guides.items()}
+    assert clean_guides(replace(noisy, filtered_guides=filtered)) is filtered
+
+
+def test_only_a_network_that_relies_on_clean_guides_has_them_filtered(monkeypatch):
+    for has, preset, filters in ((True, "quality", True), (False, "quality", False), (True, "fast", False)):
+        monkeypatch.setattr(unet_denoiser, "has_oidn_networks", lambda has=has: has)
+        found = open_network(shipped_weights(preset)).filter_guides
+        assert found is (unet_denoiser.prefilter_guides if filters else None)
+
+
+def test_a_shot_of_few_samples_is_denoised_with_filtered_guides(tmp_path):
+    """From the denoiser to the network: the pipeline gives its stream the filter."""
+    asked = []
+
+    class Denoiser:
+        def filter_guides(self, guides):
+            asked.append(guides)
+            return guides
+
+        def __call__(self, aligned):
+            assert (aligned.filtered_guides is not None) == ("clean-guides" in aligned.stages)
+            return Denoised(aligned.centre_irradiance * aligned.modulation)
+
+    for stages in ({"warp"}, {"warp", "clean-guides"}):
+        shot = open_shot(SCENE.write(tmp_path / "in"))
+        made = list(denoise_view(shot, tmp_path / str(len(stages)), Denoiser(), only(stages), Classical(DRAFT)))
+        assert len(made) == SCENE.frames
+        assert len(asked) == SCENE.frames * ("clean-guides" in stages)
 
 
 @pytest.mark.parametrize("preset", ["fast", "quality"])
