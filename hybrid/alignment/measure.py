@@ -40,6 +40,8 @@ GUIDE_CHANGE = 0.02
 GRAIN_ROWS = 16
 # Rows that are compared together for noise of guides at outlines, of `SmallFrame.factor` times as many.
 OUTLINE_ROWS = 16
+# Share of the picture that must move by whole pixels for that: 1.6 % of vectors of any length end there by chance.
+WHOLE_PIXELS = 0.05
 # Areas whose means show changes that noise hides in 9×9 pixels: they must differ by more than a twentieth, and by eight
 # standard errors, as samples that a pixel filter spreads are alike in several pixels.
 AREA, AREA_CHANGE, AREA_NOISE = 32, 0.05, 8.0
@@ -548,14 +550,14 @@ def _outline_noise(
 ) -> tuple[float, float]:
     """Share of the noise of albedo and normals at outlines that move by whole pixels, in one of `factor` bands of rows.
 
-    0 without vectors.
+    0 without vectors, and where next to nothing moves by whole pixels.
     """
     both = {
         name: (guide, other)
         for name, guide, other in (("albedo", here.albedo, there.albedo), ("normal", here.normal, there.normal))
         if guide is not None and other is not None
     }
-    if vectors is None or not both:
+    if vectors is None or not both or at_whole_pixels(vectors[0][::factor, ::factor]).mean() < WHOLE_PIXELS:
         return 0.0, 0.0
     others = {f"other_{name}": other for name, (_, other) in both.items()}
     found: list[tuple[Array, Array, Mask]] = []

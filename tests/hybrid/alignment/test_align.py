@@ -162,5 +162,13 @@ def test_noise_of_guides_at_outlines_is_measured_and_forgiven(tmp_path):
         pairs = stream.measurements(stream.around(MIDDLE))[1]
         assert noise == min(pair.outline_noise[0] for pair in pairs)
         found[samples] = noise, stream.align(MIDDLE).confidence[1].mean()
+
+        def move(index, layers, speckle=speckle):
+            speckle(index, layers)
+            layers["ViewLayer.Vector"][:] = -0.3, 0, -0.3, 0
+            layers["ViewLayer.Vector"][:, [20, 23]] = 0  # outlines on next to nothing of the picture
+
+        folder = SCENE.write(tmp_path / f"{samples} between", edit=move)
+        assert FrameStream(open_shot(folder), only(STAGES)).window(MIDDLE).outline_noise == (0, 0)
     assert found[8][0] > 8 * found[512][0] > 0
     assert found[8][1] > 0.8
