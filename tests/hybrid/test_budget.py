@@ -44,6 +44,8 @@ def test_a_part_is_cut_out_of_the_middle(tmp_path):
 class Fake:
     """A denoiser that calls a function with each window."""
 
+    filter_guides = None
+
     radius = 1
 
     def __init__(self, function):
