@@ -44,9 +44,7 @@ def test_a_part_is_cut_out_of_the_middle(tmp_path):
 class Fake:
     """A denoiser that calls a function with each window."""
 
-    filter_guides = None
-
-    radius = 1
+    radius, filter_guides = 1, None
 
     def __init__(self, function):
         self.function = function
