@@ -46,8 +46,8 @@ OUTLIERS_ABOVE = 1e-5  # one firefly in a hundred thousand pixels is twenty in a
 # Upper quartile of |Δalbedo| between frames, along the vectors. Surfaces under film sampling differ by less;
 # with few samples, under depth of field or behind glass by more.
 GUIDE_NOISE_ABOVE = 0.003
-# Noise of guides at outlines, from which on the network `quality` gains by guides without it: of 8 samples it is 0.04
-# to 0.1, and the gain 0.2 dB; of 32 it is 0.005 to 0.02.
+# Noise of guides at outlines from which on they are filtered for networks: at 8 samples it is 0.04 and more, and
+# `quality` gains 0.07 dB; at 32 samples it is 0.005 to 0.03, and the gain 0.03.
 OUTLINE_NOISE_ABOVE = 0.02
 # Light has more noise than this, as a share of it, at one or two samples a pixel, and in dim rooms at 30. With one
 # sample Cycles makes the guides of all frames alike, their noise included.
