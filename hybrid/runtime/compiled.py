@@ -2,13 +2,15 @@
 
 numba loads this module because `hybrid.runtime.threads.CACHE_LOCATORS` names it. It would raise "cannot cache
 function" where neither the package's folder nor the user's can be written to, as on a render farm, and any error of
-unpickling a truncated file.
+unpickling a truncated file. It would use a loop that was compiled before a constant or a function from another module
+changed.
 
 As a program it compiles loops that are needed late, for the process that has started it as a helper.
 """
 
 import atexit
 import gc
+import hashlib
 import logging
 import os
 import shutil
@@ -16,9 +18,11 @@ import stat
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from contextlib import suppress
-from functools import lru_cache, wraps
+from functools import cache, lru_cache, wraps
 from pathlib import Path
+from types import CodeType, FunctionType
 from typing import Any, Self
 
 import numpy as np
@@ -150,6 +154,41 @@ def _load(load: Any) -> Any:
     return load_or_forget
 
 
+def _used_by(function: FunctionType, seen: set[FunctionType]) -> Iterator[str]:
+    """Constants that a loop contains, and the files of functions that it calls; numba's key has its own file alone."""
+    if function in seen:
+        return
+    seen.add(function)
+    yield _digest_of(function.__code__.co_filename)
+    codes = [function.__code__]
+    for code in codes:
+        codes += (constant for constant in code.co_consts if isinstance(constant, CodeType))
+        for name in code.co_names:
+            value = function.__globals__.get(name)
+            if isinstance(called := getattr(value, "py_func", value), FunctionType):
+                yield from _used_by(called, seen)
+            elif isinstance(value, bool | int | float | str | tuple | np.generic):
+                yield f"{name}={value!r}"
+            elif isinstance(value, np.ndarray):
+                yield f"{name}={value.dtype}{value.tolist()}"
+
+
+@cache
+def _digest_of(file: str) -> str:
+    """Digest of a source file; empty where there is none, as in a zipped program."""
+    with suppress(OSError):
+        return hashlib.sha256(Path(file).read_bytes()).hexdigest()
+    return ""
+
+
+def _key(key: Any) -> Any:
+    @wraps(key)
+    def key_with_used(self: Any, *args: Any) -> Any:
+        return (*key(self, *args), hashlib.sha256("\n".join(_used_by(self._py_func, set())).encode()).hexdigest())
+
+    return key_with_used
+
+
 def _save(save: Any) -> Any:
     @wraps(save)
     def save_or_leave(self: Any, *args: Any) -> None:
@@ -161,6 +200,7 @@ def _save(save: Any) -> Any:
     return save_or_leave
 
 
+Cache._index_key = _key(Cache._index_key)  # type: ignore[method-assign]
 Cache.load_overload = _load(Cache.load_overload)  # type: ignore[method-assign]
 Cache.save_overload = _save(Cache.save_overload)  # type: ignore[method-assign]
 
