@@ -17,7 +17,7 @@ from hybrid.alignment.prepare import PreparedFrame
 from hybrid.alignment.transfer import measure_exposure
 from hybrid.alignment.unfiltered import as_gray
 from hybrid.alignment.window import AlignedWindow, Trust, Window
-from hybrid.plan import Context, Plan
+from hybrid.plan import Plan
 from hybrid.stream import FrameStream
 from hybrid.validation import find_lost_light, find_nonfinite
 from nlm.average import average, channel_mean
@@ -185,7 +185,7 @@ class FrameDenoiser:
         stream, numbers = self.stream, self.stream.around(number)
         window: Window | None = stream.window(number)
         assert window is not None
-        plan = stream.plan(numbers, Context(window.first_pass is not None, stream.radius))
+        plan = stream.plan(numbers, stream.context(window.first_pass is not None, stream.radius))
         brightest = 0.0
         for there in window.frames:
             brightest = brightest if there is None else max(brightest, there.mean)

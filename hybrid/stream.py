@@ -151,6 +151,10 @@ class FrameStream:
             f"plan {context}", tuple(numbers), lambda *n: self.rules.decide(*self.measurements(n), context)
         )
 
+    def context(self, first_pass: bool, radius: int) -> Context:
+        """Describe a window of this stream to `plan`."""
+        return Context(first_pass, radius, clean_guides=self._filter_guides is not None)
+
     def flow(self, start: int, end: int) -> Flow | None:
         """Flow between neighbouring frames; None at a gap or a cut."""
         earlier, later = sorted((start, end))
@@ -203,7 +207,7 @@ class FrameStream:
     ) -> Window:
         expect_equal_layers(frames)  # before anything compares them
         middle = len(numbers) // 2
-        plan = self.plan(numbers, Context(denoised is not None, middle))
+        plan = self.plan(numbers, self.context(denoised is not None, middle))
         forth: dict[int, Flow | None] = {}
         back: dict[int, Flow | None] = {}
         for side in (numbers[middle + 1 :], numbers[:middle][::-1]):
@@ -228,7 +232,7 @@ class FrameStream:
             picture if picture is None or fade == NO_FADE else self.keeper.keep(picture * np.array(fade, np.float32))
             for picture, fade in zip(denoised, fades, strict=True)
         )
-        noise = least_outline_noise(self.measurements(numbers)[1])
+        noise = least_outline_noise(self.measurements(numbers)[1]) or (0.0, 0.0)
         return Window(frames, links, denoised, plan.stages, repeated, tuple(refined), noise)
 
     def _composed(

@@ -111,8 +111,9 @@ class PairFacts:
     # share of the noise that is fixed to the screen, in [-1, 1]: about 1 with one seed for all frames, else 0
     fixed_noise: float
     guide_noise: float  # upper quartile of the difference of albedo and normal between the frames, along the vectors
-    # share of the noise of albedo and normals in their variance at outlines (`flow.confidence.measure_share`)
-    outline_noise: tuple[float, float] = (0.0, 0.0)
+    # share of the noise of albedo and normals in their variance at outlines (`flow.confidence.measure_share`); None
+    # where it cannot be measured
+    outline_noise: tuple[float, float] | None = None
     cut: bool = False  # whether the frames are of different scenes, so that they must not be averaged
     repeated: bool = False  # whether the later frame repeats the earlier one, and has no samples of its own
     # factor of each channel from the earlier frame to the later, where they explain most of the change; else 1
@@ -536,21 +537,22 @@ def _guide_noise(here: PreparedFrame, there: PreparedFrame, vectors: tuple[Array
     return float(np.quantile(np.maximum.reduce(differences), 0.75)) if differences else 0.0
 
 
-def least_outline_noise(pairs: Sequence[PairFacts]) -> tuple[float, float]:
+def least_outline_noise(pairs: Sequence[PairFacts]) -> tuple[float, float] | None:
     """Return the least noise of albedo and of normals at outlines, as what vectors do not explain adds to it.
 
-    0 without vectors.
+    None if it is unknown for a pair without a cut, and without pairs.
     """
-    noises = [pair.outline_noise for pair in pairs if pair.vectors and not pair.cut]
-    return (min(n[0] for n in noises), min(n[1] for n in noises)) if noises else (0.0, 0.0)
+    noises = [pair.outline_noise for pair in pairs if not pair.cut]
+    known = [noise for noise in noises if noise is not None]
+    return (min(n[0] for n in known), min(n[1] for n in known)) if known and len(known) == len(noises) else None
 
 
 def _outline_noise(
     here: PreparedFrame, there: PreparedFrame, vectors: tuple[Array, Mask] | None, factor: int
-) -> tuple[float, float]:
+) -> tuple[float, float] | None:
     """Share of the noise of albedo and normals at outlines that move by whole pixels, in one of `factor` bands of rows.
 
-    0 without vectors, and where next to nothing moves by whole pixels.
+    None without vectors or guides, and where next to nothing moves by whole pixels.
     """
     both = {
         name: (guide, other)
@@ -558,7 +560,7 @@ def _outline_noise(
         if guide is not None and other is not None
     }
     if vectors is None or not both or at_whole_pixels(vectors[0][::factor, ::factor]).mean() < WHOLE_PIXELS:
-        return 0.0, 0.0
+        return None
     others = {f"other_{name}": other for name, (_, other) in both.items()}
     found: list[tuple[Array, Array, Mask]] = []
     for top in range(0, len(here.valid), factor * OUTLINE_ROWS):

@@ -101,6 +101,15 @@ def test_fireflies_call_for_rejection(tmp_path):
     assert decisions(Scene(noise=0.1).write(tmp_path / "burnt", edit=burn))["outliers"].on
 
 
+def test_only_a_denoiser_that_needs_guides_without_noise_has_them_filtered(shot_folder):
+    """The plan of every preset listed a stage that one of them has."""
+    shot, rules = open_shot(shot_folder), Rules(on=frozenset({"clean-guides"}))
+    assert decision_of("clean-guides", plan_shot(shot, rules)).on
+    stage = decision_of("clean-guides", plan_shot(shot, rules, context=DENOISED._replace(clean_guides=False)))
+    assert not stage.on
+    assert stage.reason.startswith("this denoiser needs no guides without noise; forced")
+
+
 def test_noise_in_the_guides_calls_for_prefiltering(tmp_path):
     def blur(index, layers):
         noise = np.random.default_rng(index).normal(0, 0.1, layers["ViewLayer.Denoising Albedo"].shape)
@@ -113,7 +122,7 @@ def test_noise_in_the_guides_calls_for_prefiltering(tmp_path):
 
 
 def test_noise_at_outlines_calls_for_guides_without_it(tmp_path):
-    """Few pixels have it, so that the quartile which calls for prefiltering does not show it."""
+    """Few pixels have it, so that the quartile which calls for prefiltering does not show it. Unknown noise counts."""
 
     def mix(samples):
         def edit(index, layers):
@@ -125,6 +134,11 @@ def test_noise_at_outlines_calls_for_guides_without_it(tmp_path):
         return edit
 
     scene = Scene(step=(0, 0))
+    unknown = decisions(scene.write(tmp_path / "unknown", without={"Vector"}))["clean-guides"]
+    assert unknown.on
+    assert unknown.reason.startswith("the noise of the guides at outlines is unknown")
+    without = {"Vector", "Denoising Albedo", "Denoising Normal"}
+    assert not decisions(scene.write(tmp_path / "none", without=without))["clean-guides"].on
     few, many = (decisions(scene.write(tmp_path / str(n), edit=mix(n)))["clean-guides"] for n in (8, 512))
     assert few.on
     assert few.figure > 10 * many.figure > 0

@@ -9,6 +9,7 @@ import pytest
 
 from hybrid.alignment import align as alignment
 from hybrid.alignment.align import align
+from hybrid.alignment.measure import least_outline_noise
 from hybrid.alignment.transfer import ALBEDO_FLOOR
 from hybrid.files.shots import open_shot
 from hybrid.first_pass import PerFrame
@@ -160,7 +161,7 @@ def test_noise_of_guides_at_outlines_is_measured_and_forgiven(tmp_path):
         stream = FrameStream(open_shot(folder), only(STAGES))
         noise = stream.window(MIDDLE).outline_noise[0]
         pairs = stream.measurements(stream.around(MIDDLE))[1]
-        assert noise == min(pair.outline_noise[0] for pair in pairs)
+        assert noise == min(pair.outline_noise[0] for pair in pairs) == least_outline_noise(pairs)[0]
         found[samples] = noise, stream.align(MIDDLE).confidence[1].mean()
 
         def move(index, layers, speckle=speckle):
@@ -168,7 +169,8 @@ def test_noise_of_guides_at_outlines_is_measured_and_forgiven(tmp_path):
             layers["ViewLayer.Vector"][:] = -0.3, 0, -0.3, 0
             layers["ViewLayer.Vector"][:, [20, 23]] = 0  # outlines on next to nothing of the picture
 
-        folder = SCENE.write(tmp_path / f"{samples} between", edit=move)
-        assert FrameStream(open_shot(folder), only(STAGES)).window(MIDDLE).outline_noise == (0, 0)
+        stream = FrameStream(open_shot(SCENE.write(tmp_path / f"{samples} between", edit=move)), only(STAGES))
+        assert stream.window(MIDDLE).outline_noise == (0, 0)
+        assert least_outline_noise(stream.measurements(stream.around(MIDDLE))[1]) is None
     assert found[8][0] > 8 * found[512][0] > 0
     assert found[8][1] > 0.8

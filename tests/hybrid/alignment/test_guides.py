@@ -80,7 +80,9 @@ def test_a_stream_filters_each_frame_once_for_those_who_ask(tmp_path) -> None:
         np.testing.assert_array_equal(guide[band.inner], whole.filtered_guides[name][:8])
     for others in (
         FrameStream(shot, only(stages - {"clean-guides"}), first_pass, filter_guides=halve),
-        FrameStream(shot, only(stages), first_pass),
+        FrameStream(shot, only(stages), first_pass),  # its plan has no such stage, which it could not run
         FrameStream(shot, only(stages), filter_guides=halve),
     ):
         assert others.align(scene.first + 2).filtered_guides is None
+    assert "clean-guides" in stream.align(scene.first + 2).stages
+    assert "clean-guides" not in FrameStream(shot, only(stages), first_pass).align(scene.first + 2).stages
