@@ -160,24 +160,15 @@ def local_variance(albedo: np.ndarray | None, normal: np.ndarray | None) -> np.n
     """Variance of albedo and of unit normals (H, W, C) in 3×3 pixels, summed over channels, (H, W, 2) float32.
 
     That of an albedo above 1 is relative, as in `compare_guides`; that of a missing guide is 0. Values that are not
-    finite count as 0. Raises ValueError without any guide.
+    finite, or beyond 1e15, count as 0. Raises ValueError without any guide.
     """
     given = albedo if albedo is not None else normal
     if given is None:
         raise ValueError("albedo and normal: expected at least one of them, got none")
     variance = np.zeros((*given.shape[:2], 2), np.float32)
     for index, guide in enumerate((albedo, normal)):
-        if guide is None:
-            continue
-        # Squares of more than 1e18 overflow, and an infinity would spoil the filter's running sums.
-        finite = np.clip(np.nan_to_num(np.asarray(guide, np.float32), posinf=0, neginf=0), -1e15, 1e15)
-        means, squares = (cv2.blur(x, (3, 3)).reshape(finite.shape) for x in (finite, finite * finite))
-        spread = np.maximum(squares - means * means, 0).sum(axis=-1)
-        if index == 0:
-            unit = np.square(np.maximum(finite.max(axis=-1), 1))
-        else:
-            unit = np.maximum(np.square(finite).sum(axis=-1), _SURFACE)
-        np.divide(spread, unit, out=variance[..., index])
+        if guide is not None:
+            run_bands(_spread, len(variance), np.ascontiguousarray(guide, np.float32), index == 0, variance[..., index])
     return variance
 
 
@@ -250,6 +241,37 @@ def _fill(first: int, last: int, warped: np.ndarray, centre: np.ndarray, coverag
             if coverage[y, x] == 0:
                 for c in range(warped.shape[2]):
                     warped[y, x, c] = centre[y, x, c]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _spread(first: int, last: int, guide: np.ndarray, is_albedo: bool, out: np.ndarray) -> None:
+    """Write variances in 3×3 pixels, mirrored at borders, over the square of the albedo above 1 or of the normal."""
+    height, width, channels = guide.shape
+    zero, ninth = np.float32(0), np.float32(1 / 9)
+    for y in range(first, last):
+        rows = abs(y - 1), y, min(y + 1, max(2 * height - 3 - y, 0))
+        for x in range(width):
+            columns = abs(x - 1), x, min(x + 1, max(2 * width - 3 - x, 0))
+            spread, greatest, square = zero, np.float32(1), zero
+            for c in range(channels):
+                total = zero
+                for row in rows:
+                    for column in columns:
+                        total += _bounded(guide[min(row, height - 1), min(column, width - 1), c])
+                mean = total * ninth
+                for row in rows:
+                    for column in columns:
+                        spread += (_bounded(guide[min(row, height - 1), min(column, width - 1), c]) - mean) ** 2
+                own = _bounded(guide[y, x, c])
+                greatest = max(greatest, own)
+                square += own * own
+            out[y, x] = spread * ninth / (greatest * greatest if is_albedo else max(square, _SURFACE))
+
+
+@njit(nogil=True)
+def _bounded(value: np.float32) -> np.float32:
+    """The value, or 0 where it is not finite or its square would overflow."""
+    return value if abs(value) < np.float32(1e15) else np.float32(0)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
