@@ -1,6 +1,7 @@
 """Align a window of frames to its centre (`align`, for all filters and networks), and results to each other."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -113,6 +114,8 @@ def align(
         modulation = np.ones_like(own)
         if clean is not None and centre.demodulated:
             modulation = remodulate(modulation, clean)
+            if "prefilter" in stages:
+                sources = replace(sources, modulation=modulation)
         guided = guided or bool(centre.aovs)
         clean = clean if guided else None
         confidence = warped.confidence

@@ -71,6 +71,8 @@ class WarpSources:
     first_pass: Sequence[Array | None]  # (H, W, 3): denoised radiance of each frame; empty without a first pass
     limited: Sequence[Limited | None]  # as `Window.limited`
     rows: slice  # of the centre
+    # (h, W, 3): radiance of an irradiance of 1 at the centre, where the albedo has noise
+    modulation: Array | None = None
 
     def warp(self, name: str, centre_layer: Array, part: slice = slice(None)) -> Array:
         """Warp a layer of all frames, (T, h, W, 3), to rows of the centre, or all; its own where there is no flow."""
@@ -93,7 +95,7 @@ class WarpSources:
         return self.rows.stop - self.rows.start, width
 
     def residual(self, part: tuple[slice, slice] = np.s_[:, :], *, limited: bool = False) -> Array:
-        """Noisy irradiance − first pass of each frame, (T, h, w, 3), each divided by its own albedo.
+        """Noisy irradiance − first pass of each frame, (T, h, w, 3), over its own albedo, or over the `modulation`.
 
         Warped to the nearest pixel; 0 where a frame or its first pass is missing. `part` are rows and columns;
         `limited` as a network gets it, with bright samples limited and their light spread.
@@ -106,8 +108,9 @@ class WarpSources:
             if frame is None or denoised is None:
                 out[:] = 0
                 continue
-            divisor, moved = frame.albedo if frame.demodulated else None, None if flow is None else flow[part]
-            warp_residual(frame.irradiance, denoised, divisor, moved, (self.rows.start + top, left), out, limit)
+            divisor, start = frame.albedo if frame.demodulated else None, (self.rows.start + top, left)
+            moved, clean = (None if layer is None else layer[part] for layer in (flow, self.modulation))
+            warp_residual(frame.irradiance, denoised, divisor, moved, start, out, limit, clean)
         return residuals
 
     def residual_strips(self) -> Iterator[tuple[int, Array]]:

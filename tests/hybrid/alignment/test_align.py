@@ -146,6 +146,24 @@ def test_the_range_of_the_samples_is_found_while_they_are_averaged(stages, tmp_p
     assert (ranged.known_range is None) == ("blend-samples" not in stages)
 
 
+@pytest.mark.parametrize("stages", [{"demodulate"}, {"demodulate", "prefilter"}])
+def test_samples_keep_their_light_where_the_albedo_has_their_noise(stages, tmp_path):
+    """In moving glass each sample shows its own surface: a third of the light was lost, and samples below 0 pooled."""
+
+    def mix(index, layers):
+        bright = np.random.default_rng(index).random((SCENE.height, SCENE.width, 1)) < 0.1
+        layers["ViewLayer.Denoising Albedo"][:] = np.where(bright, 1, 0.01)
+        layers["ViewLayer.Combined"][:] = np.where(bright, 10, 0)
+
+    shot = open_shot(SCENE.write(tmp_path, edit=mix))
+    right = PerFrame(lambda frame: np.ones_like(frame.color))
+    aligned = FrameStream(shot, only(stages), right).align(MIDDLE)
+    light = (aligned.first_pass + aligned.sources.residual()) * aligned.modulation
+    np.testing.assert_allclose(light[2], shot.read(MIDDLE).color, atol=1e-3)
+    if "prefilter" in stages:
+        assert light.mean() == pytest.approx(1, abs=0.1)
+
+
 def test_noise_of_guides_at_outlines_is_measured_and_forgiven(tmp_path):
     """Textured surfaces of a render of few samples were trusted half as much."""
     found = {}

@@ -24,6 +24,17 @@ def test_the_difference_is_moved_by_whole_pixels(moves, divided):
     np.testing.assert_array_equal(found, expected if moves else difference[rows])
 
 
+def test_residuals_over_the_modulation_of_the_centre_are_those_of_the_radiance():
+    rng = np.random.default_rng(0)
+    radiance, first_pass, albedo, modulation = rng.random((4, 20, 30, 3), np.float32)
+    flow = rng.normal(0, 4, (20, 30, 2)).astype(np.float32)
+    found = np.empty_like(radiance)
+    given = demodulate(radiance, albedo), first_pass, albedo, flow
+    warp_residual(*given, (0, 0), found, modulation=modulation)
+    moved = warp(radiance - first_pass, flow, interpolation="nearest")[0]
+    np.testing.assert_allclose(found * modulation, moved, atol=1e-5)
+
+
 def few_bright_samples(scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """A gray wall of light 1 that one sample in fifty carries, and a first pass that is right."""
     rng = np.random.default_rng(1)
