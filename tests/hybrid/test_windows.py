@@ -245,7 +245,7 @@ def test_every_stage_can_be_forced_either_way(tmp_path, stage):
     for rules, there in ((Rules(on=frozenset({stage})), True), (Rules(off=frozenset({stage})), False)):
         # With a first pass outliers are not rejected.
         first_pass = None if stage == "outliers" else PerFrame(lambda frame: frame.color)
-        window = FrameStream(shot, rules, first_pass).align(1003)
+        window = FrameStream(shot, rules, first_pass, filter_guides=dict).align(1003)
         assert (stage in window.stages) == there
         context = NOISY if stage == "outliers" else DENOISED
         decision = next(d for d in plan_shot(shot, rules, context=context).decisions if d.stage == stage)
