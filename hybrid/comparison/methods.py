@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from flow.tvl1 import refine_flow
+from hybrid.alignment.guides import GuideFilter
 from hybrid.alignment.window import AlignedWindow
 from hybrid.files.frame import Array, Frames, MappedShot
 from hybrid.files.shots import Shot
@@ -82,7 +83,7 @@ class WindowSettings:
     vectors: bool = True  # whether the renderer's are read
     solver: Mapping[str, Any] = field(default_factory=dict)  # of TV-L1, which runs then
 
-    def stream(self, shot: Frames) -> FrameStream:
+    def stream(self, shot: Frames, filter_guides: GuideFilter | None = None) -> FrameStream:
         frames = shot
         if not self.vectors:
             frames = MappedShot(shot, lambda frame: replace(frame, motion=None, motion_convention=None))
@@ -94,7 +95,9 @@ class WindowSettings:
             backends = Backends(bundled=denoise_bundled)
         chosen = named_first_pass(self.source, mode=OIDN_MODE_OF_NETWORKS, backends=backends)
         refine = partial(refine_flow, **self.solver)
-        return FrameStream(frames, rules, chosen.first_pass, radius=self.radius, refine=refine)
+        return FrameStream(
+            frames, rules, chosen.first_pass, radius=self.radius, refine=refine, filter_guides=filter_guides
+        )
 
 
 @dataclass(frozen=True)
@@ -125,16 +128,19 @@ class Network:
 
     def __call__(self, shot: Frames) -> Iterator[tuple[int, Array]]:
         denoiser = _denoiser(self.preset, self.tile, self.precision, self.threshold)
-        frames = FrameDenoiser(replace(self.window, radius=denoiser.radius).stream(shot), denoiser)
+        frames = FrameDenoiser(self._stream(shot, denoiser), denoiser)
         for number in shot.numbers:
             yield number, frames.make(number).denoised.color
 
     def maps(self, shot: Frames, numbers: Sequence[int]) -> Iterator[tuple[int, dict[str, Array]]]:
         """Yield number and `window_maps` of some frames, in float32: differences of runs must exceed rounding."""
         denoiser = _denoiser(self.preset, None, "float32", None)
-        stream = replace(self.window, radius=denoiser.radius).stream(shot)
+        stream = self._stream(shot, denoiser)
         for number in numbers:
             yield number, window_maps(stream.align(number), lambda window: denoiser(window).color)
+
+    def _stream(self, shot: Frames, denoiser: "NetworkDenoiser") -> FrameStream:
+        return replace(self.window, radius=denoiser.radius).stream(shot, denoiser.filter_guides)
 
 
 @lru_cache(maxsize=1)

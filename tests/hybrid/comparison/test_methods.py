@@ -9,13 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hybrid.alignment.window import AlignedWindow
 from hybrid.comparison import methods
-from hybrid.comparison.methods import METHODS, aligned_average, window_maps
+from hybrid.comparison.methods import METHODS, Network, WindowSettings, aligned_average, window_maps
 from hybrid.comparison.metrics import psnr
 from hybrid.files.shots import Shot, open_shot
 from hybrid.files.sources import MADE_FROM
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import filter_window
+from hybrid.stabilize import Denoised
 from hybrid.stream import FrameStream
 from nlm.average import average
 from tests.exr_files import write_layers
@@ -106,3 +108,23 @@ def test_a_missing_estimate_makes_a_method_absent(shot: Shot, monkeypatch: pytes
     monkeypatch.setattr(first_pass, "why_no_oidn", lambda: "pyoidn is not installed")
     with pytest.raises(ImportError, match="pyoidn is not installed"):
         next(METHODS["gated OIDN"].run(shot))
+
+
+def test_a_network_gets_its_guides_filtered_as_in_a_run(shot: Shot, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without them `quality` of a comparison was 1.1 dB below that of `ravg denoise` at 8 samples."""
+    guided = []
+
+    class Denoiser:
+        radius = 1
+        filter_guides = staticmethod(dict)
+
+        def __call__(self, aligned: AlignedWindow) -> Denoised:
+            guided.append(aligned.filtered_guides is not None)
+            return Denoised(aligned.centre_irradiance * aligned.modulation)
+
+    monkeypatch.setattr(methods, "_denoiser", lambda *settings: Denoiser())
+    network = Network("quality", WindowSettings(source="nlm", rules=only({"demodulate", "warp", "clean-guides"})))
+    for _ in network(shot):
+        assert guided.pop()
+    for _ in network.maps(shot, shot.numbers[:1]):
+        assert guided.pop()
