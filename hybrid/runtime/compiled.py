@@ -21,6 +21,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import cache, lru_cache, wraps
+from importlib import import_module
 from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any, Self
@@ -200,12 +201,13 @@ def _save(save: Any) -> Any:
     return save_or_leave
 
 
-Cache._index_key = _key(Cache._index_key)  # type: ignore[method-assign]
-Cache.load_overload = _load(Cache.load_overload)  # type: ignore[method-assign]
-Cache.save_overload = _save(Cache.save_overload)  # type: ignore[method-assign]
-
-
-if __name__ == "__main__":
+if __name__ != "__main__":
+    Cache._index_key = _key(Cache._index_key)  # type: ignore[method-assign]
+    Cache.load_overload = _load(Cache.load_overload)  # type: ignore[method-assign]
+    Cache.save_overload = _save(Cache.save_overload)  # type: ignore[method-assign]
+else:
+    # By its name this module changes numba's cache; changed twice, its keys would be found by no other process.
+    import_module("hybrid.runtime.compiled")
     gc.disable()
     from nlm.nonlocal_means import joint_nlm
     from nlm.samples import average_neighbours, blend_samples, restore_mean

@@ -194,6 +194,29 @@ def test_the_longest_loop_is_compiled_beside_the_first_run_and_found_there(shot_
     assert list((tmp_path / "cache").rglob("nonlocal_means._filter-*.nbc"))
 
 
+AFTER = """
+from hybrid.runtime.threads import prepare_libraries
+prepare_libraries()
+import subprocess, sys
+import numpy as np
+from numba.core import event
+from nlm.nonlocal_means import joint_nlm
+
+subprocess.run([sys.executable, "-m", "hybrid.runtime.compiled"], check=True)
+with event.install_recorder("numba:compile") as compiled:
+    joint_nlm(np.zeros((1, 4, 4, 1), np.float32), np.zeros((4, 4, 1), np.float32))
+print(len(compiled.buffer))
+"""
+
+
+def test_loops_that_the_program_has_compiled_are_found(tmp_path):
+    """It changed the key of numba's cache twice, and the first run compiled all of it again."""
+    env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    words = [sys.executable, "-c", AFTER]
+    done = subprocess.run(words, env=env, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["0"]
+
+
 @pytest.mark.parametrize("collects", [True, False])
 def test_no_garbage_is_looked_for_while_a_loop_is_compiled(collects):
     """It took a fifth of the compilation; a loop that calls others compiles these first."""
