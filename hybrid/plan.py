@@ -60,7 +60,7 @@ class Context(NamedTuple):
 
     first_pass: bool  # whether its frames come with denoised frames
     radius: int = RADIUS  # frames on each side of the centre
-    clean_guides: bool = True  # whether the denoiser is a network that needs guides without noise
+    filters_guides: bool = True  # whether the denoiser has the guides of frames filtered
 
 
 #: A window of noisy frames alone, and one with a first pass.
@@ -148,8 +148,8 @@ class Rules:
             on, reason = False, f"the averaging of denoised frames bounds what single samples add; {reason}"
         if stage == "drift" and on and (not context.first_pass or context.radius < 2):
             on, reason = False, f"needs denoised frames, and windows of five or more; {reason}"
-        if stage == "clean-guides" and on and not context.clean_guides:
-            on, reason = False, f"this denoiser needs no guides without noise; {reason}"
+        if stage == "clean-guides" and on and not context.filters_guides:
+            on, reason = False, f"this denoiser has no filter of guides; {reason}"
         return replace(decision, on=on, reason=reason, forced=forced)
 
 

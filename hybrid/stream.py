@@ -153,7 +153,7 @@ class FrameStream:
 
     def context(self, first_pass: bool, radius: int) -> Context:
         """Describe a window of this stream to `plan`."""
-        return Context(first_pass, radius, clean_guides=self._filter_guides is not None)
+        return Context(first_pass, radius, filters_guides=self._filter_guides is not None)
 
     def flow(self, start: int, end: int) -> Flow | None:
         """Flow between neighbouring frames; None at a gap or a cut."""

@@ -95,8 +95,9 @@ class WarpSources:
         return self.rows.stop - self.rows.start, width
 
     def residual(self, part: tuple[slice, slice] = np.s_[:, :], *, limited: bool = False) -> Array:
-        """Noisy irradiance − first pass of each frame, (T, h, w, 3), over its own albedo, as far as that is clean.
+        """Noisy irradiance − first pass of each frame, (T, h, w, 3), each divided by its own albedo.
 
+        With `modulation` by the centre's, as far as a frame's own is not clean (`warp_residual`).
         Warped to the nearest pixel; 0 where a frame or its first pass is missing. `part` are rows and columns;
         `limited` as a network gets it, with bright samples limited and their light spread.
         """

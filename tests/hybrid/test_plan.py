@@ -101,13 +101,13 @@ def test_fireflies_call_for_rejection(tmp_path):
     assert decisions(Scene(noise=0.1).write(tmp_path / "burnt", edit=burn))["outliers"].on
 
 
-def test_only_a_denoiser_that_needs_guides_without_noise_has_them_filtered(shot_folder):
+def test_only_a_denoiser_with_a_filter_of_guides_has_them_filtered(shot_folder):
     """The plan of every preset listed a stage that one of them has."""
     shot, rules = open_shot(shot_folder), Rules(on=frozenset({"clean-guides"}))
     assert decision_of("clean-guides", plan_shot(shot, rules)).on
-    stage = decision_of("clean-guides", plan_shot(shot, rules, context=DENOISED._replace(clean_guides=False)))
+    stage = decision_of("clean-guides", plan_shot(shot, rules, context=DENOISED._replace(filters_guides=False)))
     assert not stage.on
-    assert stage.reason.startswith("this denoiser needs no guides without noise; forced")
+    assert stage.reason.startswith("this denoiser has no filter of guides; forced")
 
 
 def test_noise_in_the_guides_calls_for_prefiltering(tmp_path):
