@@ -206,6 +206,11 @@ def _open(path: str | os.PathLike[str]) -> Iterator[tuple[Any, dict[str, str]]]:
         raise ValueError(f"{where}: no safetensors file, or cut short ({_short(error)})") from error
 
 
+def find_weights(name: str) -> Path:
+    """Path of a file of weights, or of those of a preset that ships; ValueError for a preset that does not."""
+    return Path(name) if Path(name).suffix else shipped_weights(name)
+
+
 def shipped_weights(preset: str) -> Path:
     """Path of the weights of a preset that ships; ValueError, with the names of those that ship, for any other."""
     folder = Path(__file__).parent / "weights"

@@ -72,6 +72,7 @@ def make_clips(
     first_pass: Annotated[str, opt.check_first_pass] = "auto",
     reference: bool = False,
     target: str | None = None,
+    teacher: str | None = None,
     seed: int = 0,
     scheduler: str | None = None,
     **how: Any,
@@ -81,6 +82,8 @@ def make_clips(
         raise typer.BadParameter(f"--window is {window}, expected 1, 3, 5 or 7")
     if reference and target is not None:
         raise typer.BadParameter("--target: expected none with --reference, which is the target")
+    if teacher is not None and not reference:
+        raise typer.BadParameter("--teacher: expected --reference beside it")
     neural = import_neural()
     with opt.usage():
         samples = None if levels is None else parse_samples(levels)
@@ -96,6 +99,9 @@ def make_clips(
         return
     output.mkdir(parents=True, exist_ok=True)
     reuse_freed_memory()
+    denoiser = None if teacher is None else neural.open_network(neural.find_weights(teacher))
+    if denoiser is not None and denoiser.radius != window // 2:
+        raise ValueError(f"teacher: expected --window {2 * denoiser.radius + 1}, as {teacher} has, got {window}")
     bar = Progress("make-clips", sum(len(each.first) for each in opened))
     for each in opened:
         if any(output.glob(f"{glob.escape(each.name)}.[0-9][0-9][0-9][0-9].safetensors")):
@@ -120,6 +126,7 @@ def make_clips(
             tile=tile,
             tiles=tiles,
             estimate=first_pass,
+            teacher=None if denoiser is None else lambda aligned: denoiser(aligned).color,
             seed=seed,
             advance=partial(bar.advance, message=each.name),
         )

@@ -4,11 +4,11 @@ from hybrid.neural.clips import ClipSource, write_clips
 from hybrid.neural.oidn_networks import bundled_preset, denoise_bundled
 from hybrid.neural.opening import open_network
 from hybrid.neural.train import TrainInputs, train_network
-from network.checkpoint import shipped_weights
+from network.checkpoint import find_weights, shipped_weights
 from network.paper import TKPCN_WEIGHTS
 from network.presets import PRESETS as TRAINING_PRESETS
 
 __all__ = [
     "TKPCN_WEIGHTS", "TRAINING_PRESETS", "ClipSource", "TrainInputs", "bundled_preset", "denoise_bundled",
-    "open_network", "shipped_weights", "train_network", "write_clips",
+    "find_weights", "open_network", "shipped_weights", "train_network", "write_clips",
 ]  # fmt: skip

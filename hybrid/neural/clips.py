@@ -7,20 +7,30 @@ from typing import cast
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from hybrid.alignment.transfer import measure_exposure
 from hybrid.alignment.window import AlignedWindow
+from hybrid.files.frame import Array
 from hybrid.files.shots import Shot
 from hybrid.first_pass import OIDN_MODES, find_first_pass
 from hybrid.neural.network_denoiser import exposure_of
 from hybrid.neural.oidn_networks import has_oidn_networks, prefilter_guides
-from hybrid.neural.tiling import tensor_of
+from hybrid.neural.tiling import image_of, tensor_of
 from hybrid.neural.unet_denoiser import clean_guides, gain_of
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import gated_average, pool_and_denoise
 from hybrid.stream import FrameStream
 from network.training.clips import Clip, importance, important_places, write_shards
 from nlm.average import replace_nonfinite
+from nlm.variance import gaussian_mean
+
+# Deviation, pixels, of the Gaussian over which targets get the mean of a render: 450 pixels of 64 samples know it to 1 %
+# where one pixel's noise is twice its light.
+_SIGMA = 6.0
+# A pixel of the render counts up to this many times the light around it, lest a firefly brighten 450 pixels.
+_FAR = np.float32(20)
+# This share of the exposure is added to both means: black stays black, and noise in the dark decides nothing.
+_DARK = np.float32(0.01)
 
 
 @dataclass(frozen=True)
@@ -54,15 +64,20 @@ def write_clips(
     tile: int = 128,
     tiles: int = 4,
     estimate: str = "auto",
+    teacher: Callable[[AlignedWindow], Array] | None = None,
     seed: int = 0,
     advance: Callable[[], object] = lambda: None,
 ) -> list[Path]:
     """Write the training clips of a shot; return the shards (paper, section 6, "Training Data").
 
     In each frame `importance` places `tiles` clips of `tile` pixels a side (0: the whole frame), with a seed.
-    `estimate` is the source of the first passes; not "none". Raises ValueError if the levels have no frame in common,
-    frames are smaller than a tile, or there is no first pass.
+    `estimate` is the source of the first passes; not "none". With a `teacher`, a denoiser of windows, the target of a
+    level is the mean of the reference and of the teacher's frame, with the local means of the cleanest level. Raises
+    ValueError if the levels have no frame in common, frames are smaller than a tile, there is no first pass, or a
+    teacher and no reference.
     """
+    if teacher is not None and source.reference is None:
+        raise ValueError(f"teacher: expected references beside it, got none of {source.name}")
     shots, numbers = list(source.levels.values()), source.numbers()
     rendered = [*shots, *([] if source.target is None else [source.target])]
     first_passes = [find_first_pass(estimate, shot) for shot in rendered]
@@ -75,7 +90,7 @@ def write_clips(
     has_oidn = all(first_pass.name in OIDN_MODES for first_pass in first_passes)
     make_target = pool_and_denoise if has_oidn else gated_average
 
-    def targets_of(number: int) -> dict[str, NDArray[np.float32]]:
+    def targets_of(number: int) -> dict[str, Array]:
         """Targets that all levels of a frame share, if any."""
         if source.reference is not None:
             return {"reference": replace_nonfinite(source.reference.read(number).color)[0]}
@@ -85,14 +100,19 @@ def write_clips(
         return {"reference": make_target(streams[-1].align(number)), "rendered": render}
 
     def clips() -> Iterator[Clip]:
-        rng = np.random.default_rng(seed)
+        rng, cleanest = np.random.default_rng(seed), int(np.argmax(source.samples))
         for number in numbers:
             targets = targets_of(number)
             after = number + shots[0].step
-            make_own = None if targets else make_target
+            make_own = make_target if not targets else teacher
             levels = [
                 _level(shot, stream, number, after, make_own) for shot, stream in zip(shots, streams, strict=False)
             ]
+            if teacher is not None:
+                reference, render = targets.pop("reference"), image_of(levels[cleanest]["noisy"])
+                for level in levels:
+                    mean = 0.5 * (reference + image_of(level.pop("pseudo_reference")))
+                    level["reference"] = tensor_of(_with_means(mean, render)[None])[:, 0]
             frame = _clip(levels, targets, linked=after in numbers)
             if tile == 0:
                 yield frame
@@ -102,6 +122,19 @@ def write_clips(
             advance()
 
     return write_shards(folder, source.name, source.samples, clips())
+
+
+def _with_means(image: Array, render: Array) -> Array:
+    """Image (H, W, 3) with the local means of a noisy render of the same frame.
+
+    Denoised frames lose light where few pixels carry it: up to 17 % of the light of training shots. The factor between
+    both means is at most 2 either way.
+    """
+    dark = _DARK * measure_exposure(image)
+    light = gaussian_mean(image, _SIGMA) + dark
+    limited = np.clip(render, 0, _FAR * light)
+    factor = (gaussian_mean(limited, _SIGMA) + dark) / light
+    return image * np.clip(factor, np.float32(0.5), np.float32(2))
 
 
 def _places(
@@ -128,7 +161,7 @@ def _level(
     stream: FrameStream,
     number: int,
     after: int,
-    make_target: Callable[[AlignedWindow], NDArray[np.float32]] | None,
+    make_target: Callable[[AlignedWindow], Array] | None,
 ) -> dict[str, torch.Tensor]:
     """Fields of a clip at one noise level, with L = 1; with its own target if it needs one."""
     aligned = stream.align(number)
@@ -165,7 +198,7 @@ def _level(
     }
 
 
-def _clip(levels: list[dict[str, torch.Tensor]], targets: Mapping[str, NDArray[np.float32]], *, linked: bool) -> Clip:
+def _clip(levels: list[dict[str, torch.Tensor]], targets: Mapping[str, Array], *, linked: bool) -> Clip:
     values = {name: torch.cat([level[name] for level in levels]) for name in levels[0]}
     values["linked"] = values["linked"].min().expand(len(levels)) * linked
     for name, image in targets.items():

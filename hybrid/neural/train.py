@@ -11,7 +11,7 @@ import torch
 
 from hybrid.runtime.allocator import reuse_freed_memory
 from hybrid.runtime.threads import limit_threads
-from network.checkpoint import load_model, shipped_weights
+from network.checkpoint import find_weights, load_model
 from network.presets import PRESETS, Model, build_preset
 from network.robust_unet import RobustUNet, start_from_oidn
 from network.training.clips import Clips, open_clips, split_by_shot
@@ -74,7 +74,7 @@ def _initial_model(inputs: TrainInputs, training: Clips, seed: int) -> Model:
             start_from_oidn(model)
         return model
     assert init is not None
-    model = load_model(Path(init) if Path(init).suffix else shipped_weights(init))
+    model = load_model(find_weights(init))
     if model.frames != training.frames:
         raise ValueError(f"clips: expected windows of {model.frames} frames as {init} has, got {training.frames}")
     return model

@@ -31,6 +31,11 @@ RENDERS = ("noisy", "rendered")  # kinds of targets that are renders, whose nois
 SHARD_BYTES = 1 << 28  # bytes after which a shard is full: small enough to copy about, large enough that files are few
 
 
+# A level of fewer samples per pixel than this is drawn in proportion to them, but at least a quarter as often as others:
+# shots are rendered with four and more, and drawn evenly half of the crops had at most seven.
+_FEW = 8
+
+
 class Layout(NamedTuple):
     """Axes of a field of a clip behind its levels, and how it is stored and varied.
 
@@ -290,6 +295,10 @@ class Clips:
             return [[(level, kind) for kind in shard.targets] for level in range(len(shard.samples))]
         return noise_pairs(shard.samples)
 
+    def samples(self, index: int) -> tuple[float, ...]:
+        """Samples per pixel of each level."""
+        return self._find(index)[0].samples
+
     def neighbours(self, index: int) -> tuple[int, int] | None:
         """Two clips of successive frames at the same place, the given one among them, the earlier first, if any."""
         for first in (index, index - 1):
@@ -440,7 +449,8 @@ class Samples(Dataset[Sample]):
     def __getitem__(self, number: int) -> Sample:
         config, rng, index = self.config, np.random.default_rng((self.seed, 2, number)), self.clip_of(number)
         pairs = self.clips.pairs(index)
-        level = int(rng.integers(len(pairs)))
+        odds = np.clip(np.array(self.clips.samples(index)) / _FEW, 0.25, 1)
+        level = int(rng.choice(len(pairs), p=odds / odds.sum()))
         target = self._target(pairs[level], rng)
         members = self.clips.neighbours(index) if self.neighbours else (index,)
         assert members is not None  # clips without neighbours are left out

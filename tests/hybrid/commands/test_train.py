@@ -128,6 +128,21 @@ def test_clips_are_prepared_towards_references_where_asked(shot, tmp_path):
     np.testing.assert_allclose(ratio, np.median(ratio), rtol=2e-3)  # over the exposure, in half
 
 
+def test_targets_are_half_the_teachers_where_asked(shot, weights, tmp_path, capsys):
+    options = ("--levels", "a=24,c=8", "--tile", 0, "--first-pass", "nlm", "--frames", SCENE.first, "--reference")
+    for name, more in (("plain", ()), ("taught", ("--teacher", weights))):
+        assert run("make-clips", shot, "-o", tmp_path / name, *options, "--window", 3, *more) == 0
+    plain, taught = (
+        [open_clips(tmp_path / name).read(0, level, (level, "reference")).target for level in range(2)]
+        for name in ("plain", "taught")
+    )
+    assert torch.equal(*plain)  # levels share the reference
+    assert not torch.equal(*taught)  # each has its own window's
+    assert run("make-clips", shot, "-o", tmp_path / "no", *options, "--teacher", weights) == 1
+    assert "teacher: expected --window 3, as" in capsys.readouterr().err
+    assert run("make-clips", shot, "-o", tmp_path / "no", "--teacher", weights) == 2  # nothing to take the half of
+
+
 def test_clips_are_prepared_towards_the_pseudo_references_of_a_level_where_asked(shot, tmp_path, capsys):
     options = (shot, "-o", tmp_path / "clips", "--tile", 0, "--first-pass", "nlm")
     levels = ("--levels", "a=24,b=24,c=8")

@@ -158,6 +158,43 @@ def test_levels_are_trained_towards_the_pseudo_reference_of_another_render(dim, 
     np.testing.assert_array_equal(clip.rendered[0].permute(1, 2, 0).numpy(), target.read(MIDDLE).color)
 
 
+def test_targets_are_half_the_teachers_and_as_bright_as_the_cleanest_render(tmp_path, monkeypatch):
+    """A teacher sees the window of each level; where targets are too dark, the render of most samples says so."""
+    only = str(MIDDLE)
+    noisy, clean = (open_shot(SCENE.write(tmp_path / n, clean=n == "clean"), frames=only) for n in ("noisy", "clean"))
+    truth = clean.read(MIDDLE).color
+    seen = []
+
+    def dark_teacher(aligned):
+        seen.append(aligned.color[2])
+        return np.float32(0.5) * truth
+
+    found: list[Clip] = []
+    monkeypatch.setattr(module, "write_shards", lambda folder, name, samples, clips: found.extend(clips) or [])
+    source = ClipSource("wall", {"noisy": noisy, "clean": clean}, [4, 64], reference=clean)
+    write_clips(source, tmp_path, tile=0, estimate="nlm", teacher=dark_teacher)
+    assert len(seen) == 2
+    assert np.abs(seen[0] - seen[1]).max() > 0.1
+    assert found[0].pseudo_reference is None
+    for target in found[0].reference:  # three quarters of the truth before its means are restored
+        np.testing.assert_allclose(target.permute(1, 2, 0).numpy(), truth, rtol=5e-3)
+    with pytest.raises(ValueError, match="teacher: expected references beside it, got none of wall"):
+        write_clips(ClipSource("wall", {"noisy": noisy}, [4]), tmp_path, tile=0, estimate="nlm", teacher=dark_teacher)
+
+
+def test_restored_means_keep_black_black_and_mind_no_firefly():
+    image = np.zeros((60, 80, 3), np.float32)
+    image[:, 40:] = 1
+    render = 1.25 * image
+    np.testing.assert_allclose(module._with_means(image, render), render, rtol=0.02)
+    render[30, 60] = 1e6
+    with_firefly = module._with_means(image, render)
+    assert not with_firefly[:, :40].any()
+    assert with_firefly.max() < 1.5
+    for scale in (1e-4, 1e4):
+        np.testing.assert_allclose(module._with_means(scale * image, scale * render), scale * with_firefly, rtol=1e-3)
+
+
 def test_clips_of_whole_frames_know_the_way_to_the_next(tmp_path, monkeypatch):
     shot = open_shot(SCENE.write(tmp_path / "noisy"))
     found = prepare(shot, monkeypatch, tmp_path)
