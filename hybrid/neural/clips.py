@@ -24,8 +24,8 @@ from network.training.clips import Clip, importance, important_places, write_sha
 from nlm.average import replace_nonfinite
 from nlm.variance import gaussian_mean
 
-# Deviation, pixels, of the Gaussian over which targets get the mean of a render: 450 pixels of 64 samples know it to 1 %
-# where one pixel's noise is twice its light.
+# Deviation, pixels, of the Gaussian over which targets get the mean of a render: where the noise of 64 samples is a
+# fifth of the light, that of 450 pixels is a hundredth.
 _SIGMA = 6.0
 # A pixel of the render counts up to this many times the light around it, lest a firefly brighten 450 pixels.
 _FAR = np.float32(20)
@@ -134,7 +134,7 @@ def _with_means(image: Array, render: Array) -> Array:
     light = gaussian_mean(image, _SIGMA) + dark
     limited = np.clip(render, 0, _FAR * light)
     factor = (gaussian_mean(limited, _SIGMA) + dark) / light
-    return image * np.clip(factor, np.float32(0.5), np.float32(2))
+    return np.asarray(image * np.clip(factor, np.float32(0.5), np.float32(2)), np.float32)
 
 
 def _places(

@@ -31,8 +31,8 @@ RENDERS = ("noisy", "rendered")  # kinds of targets that are renders, whose nois
 SHARD_BYTES = 1 << 28  # bytes after which a shard is full: small enough to copy about, large enough that files are few
 
 
-# A level of fewer samples per pixel than this is drawn in proportion to them, but at least a quarter as often as others:
-# shots are rendered with four and more, and drawn evenly half of the crops had at most seven.
+# A level of fewer samples per pixel than this is drawn in proportion to them, but at least a quarter as often as
+# others: shots are rendered with four and more, and drawn evenly half of the crops had at most seven.
 _FEW = 8
 
 
