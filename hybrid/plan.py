@@ -193,7 +193,7 @@ def measure_stages(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> 
         _switch("drift", bool(pairs), neighbours),
         _decide_fixed_noise([pair.fixed_noise for pair in pairs]),
         prefilter,
-        _decide_clean_guides(prefilter, least_outline_noise(pairs)),
+        _decide_clean_guides(prefilter, least_outline_noise(pairs), [frame.samples for frame in frames]),
         _switch("stabilize", bool(pairs), neighbours),
         _switch("restore-mean", clean < 1, f"{1 - clean:.1%} of the tiles hold noise"),
         _switch("blend-samples", True, "each pixel is compared with its samples"),
@@ -277,13 +277,21 @@ def _decide_prefilter(grain: Sequence[float], noise: Iterable[float], unknown: b
     return _decide("prefilter", figure, GUIDE_NOISE_ABOVE, words)
 
 
-def _decide_clean_guides(prefilter: Decision, noise: tuple[float, float] | None) -> Decision:
+def _decide_clean_guides(
+    prefilter: Decision, noise: tuple[float, float] | None, samples: Sequence[float | None]
+) -> Decision:
     if prefilter.on or prefilter.figure is None:
         return replace(prefilter, stage="clean-guides")
     if noise is None:
         # Filtering costs at most 0.02 dB where guides have no noise, and gains 1.3 dB where they are of 8 samples.
         words = "the noise of the guides at outlines is unknown: no motion vectors of whole pixels"
-        return Decision("clean-guides", True, None, OUTLINE_NOISE_ABOVE, words)
+        known = [count for count in samples if count is not None]
+        if len(known) < len(samples):
+            return Decision("clean-guides", True, None, OUTLINE_NOISE_ABOVE, words)
+        # A pixel that an outline divides in halves has this variance, over that of its surroundings.
+        return _decide(
+            "clean-guides", 1 / min(known), OUTLINE_NOISE_ABOVE, f"{words}; {{:.3f}} by the samples per pixel"
+        )
     return _decide(
         "clean-guides", max(noise), OUTLINE_NOISE_ABOVE, "{:.3f} of the variance of the guides at outlines is noise"
     )

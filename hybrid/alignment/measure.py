@@ -96,6 +96,7 @@ class FrameFacts:
     outliers: float  # share of the pixels far above all their neighbours, in [0, 1]
     transparent: float | None  # share of the pixels whose alpha is below 0.999
     noise_free: float  # share of the tiles without noise, in [0, 1]
+    samples: float | None  # samples per pixel, if known
 
 
 @dataclass(frozen=True)
@@ -174,6 +175,7 @@ def measure_frame(frame: PreparedFrame, small: SmallFrame) -> FrameFacts:
         outliers=float(np.mean(rejected)),
         transparent=None if frame.alpha is None else float(np.mean(frame.alpha < 0.999)),
         noise_free=_noise_free_share(small),
+        samples=frame.samples,
     )
 
 

@@ -52,6 +52,7 @@ class PreparedFrame:
     demodulated: bool  # whether the albedo has been divided out
     pass_colors: dict[str, Array] = field(default_factory=dict)  # (H, W, 3): colors of AOVs, finite and at least 0
     passes: Passes = NO_PASSES  # how `aovs` add up to the beauty in this frame
+    samples: float | None = None  # samples per pixel, if known
     unfiltered: Unfiltered = field(default_factory=Unfiltered)  # light that is restored in the finished picture
     fireflies: int = 0  # number of fireflies that were removed
     removed_radiance: float = 0.0  # their mean radiance, which belongs to the picture in expectation
@@ -177,6 +178,7 @@ def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
         unfiltered=unfiltered,
         pass_colors=pass_colors,
         passes=passes,
+        samples=frame.samples,
     )
 
 

@@ -107,6 +107,7 @@ def decode_frame(
         aovs={name: decode_layer(image, layer, canvas) for name, layer in layers.aovs.items()},
         pass_colors={name: decode_layer(image, layer, canvas) for name, layer in layers.pass_colors.items()},
         source=image.path,
+        samples=layers.samples,
         beyond=None if beyond is None or not beyond.any() else beyond,
     )
 

@@ -35,6 +35,7 @@ class Frame:
     pass_colors: Mapping[str, np.ndarray] = field(default_factory=dict)
     passes: Passes = NO_PASSES  # how `aovs` add up to the beauty
     source: Path | None = None  # the file
+    samples: float | None = None  # samples per pixel, as the file's header states them
     # (H, W, 3): where the color is +Inf because its light exceeds the range of half; the color is NaN there
     beyond: np.ndarray | None = None
     orientation: int = 0  # in which a first pass denoises it: 0 to 3 quarter turns, 4 to 7 of the mirrored image

@@ -1,9 +1,11 @@
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from hybrid.alignment.measure import NO_FADE
+from hybrid.files.frame import MappedShot
 from hybrid.files.shots import open_shot
 from hybrid.plan import DENOISED, NOISY, STAGES, Context, Rules, merge
 from hybrid.stream import FrameStream, plan_shot
@@ -137,6 +139,12 @@ def test_noise_at_outlines_calls_for_guides_without_it(tmp_path):
     unknown = decisions(scene.write(tmp_path / "unknown", without={"Vector"}))["clean-guides"]
     assert unknown.on
     assert unknown.reason.startswith("the noise of the guides at outlines is unknown")
+    shot = open_shot(tmp_path / "unknown")
+    for samples, on in ((32, True), (64, False)):  # the variance of their noise is a part of so many
+        counted = MappedShot(shot, partial(replace, samples=samples))
+        by_samples = decision_of("clean-guides", plan_shot(counted))
+        assert by_samples.on == on
+        assert by_samples.figure == 1 / samples
     without = {"Vector", "Denoising Albedo", "Denoising Normal"}
     assert not decisions(scene.write(tmp_path / "none", without=without))["clean-guides"].on
     few, many = (decisions(scene.write(tmp_path / str(n), edit=mix(n)))["clean-guides"] for n in (8, 512))

@@ -101,4 +101,5 @@ def test_each_frame_has_the_variance_of_its_own_samples(tmp_path):
         save_file(tmp_path / f"a.{number}.exr", channels, {"samplesPerPixel": samples, "renderTimeSeconds": 1.0})
     shot = open_shot(tmp_path)
     assert [shot.read(number).variance.max() for number in (1, 2)] == [1 / 64, 1 / 256]
+    assert [shot.read(number).samples for number in (1, 2)] == [64, 256]
     assert "variance 0.00390625" in shot.reader.layer_summary(2)
