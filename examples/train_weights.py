@@ -1,12 +1,13 @@
 """A training of the final stage from OIDN's weights: render shots, make clips of them, train each preset.
 
-    python examples/train_weights.py OUT --blender-python blender/bin/python
-    python examples/train_weights.py OUT --untrained    # the initial weights, which ship
+    python examples/train_weights.py OUT --blender-python blender/bin/python --scene a.blend --scene b.blend
+    python examples/train_weights.py OUT --untrained    # the initial weights
 
-The shots are drawn from seeds (`ravg simulate random` and `hard`) and reproducible; no shot of the evaluation or of the
-tuning of ravg is among them. Each has a render of many samples. Its frames, denoised by `quality`, are the targets, and
-it is an input itself: networks trained without inputs of so many samples blurred textures (0.65 dB on one shot).
-Shots are parts of large frames, where objects are smooth, and of small frames, full of detail.
+The shots are drawn from seeds (`ravg simulate random` and `hard`, and two of each scene) and reproducible; no shot of
+the evaluation or of the tuning of ravg is among them. Each has a render of many samples. Its frames, denoised by
+`quality`, are half of the targets, and it is an input itself: networks trained without inputs of so many samples
+blurred textures (0.65 dB on one shot). The other half is what `quality` makes of each input, which is what the network
+can know. Shots are parts of large frames, where objects are smooth, and of small frames, full of detail.
 An interrupted run continues at the same shot, and trainings continue from their last checkpoint.
 docs/dev/experiments.md lists the gains.
 """
@@ -14,7 +15,9 @@ docs/dev/experiments.md lists the gains.
 import argparse
 import subprocess
 import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
@@ -22,21 +25,35 @@ from network.checkpoint import save_model
 from network.presets import build_preset
 from network.robust_unet import start_from_oidn
 
-#: Kind of shot, first seed, how many, and the film of which they are a part.
-#: Hard 6315 is left out: its smoke takes as long as ten others.
-SHOTS = [
-    ("random", 5300, 35, "1920x1080"),
-    ("random", 5335, 35, "320x180"),
-    ("hard", 6300, 15, "320x180"),
-    ("hard", 6316, 31, "1920x1080"),
-]
-RENDER = ["--frames", "1-7", "--size", "128x80", "--spp", "4-128", "--levels", "target=256,a=n,b=n/e"]
-CLIPS = "--reference --tile 0 --first-pass oidn-fast --window 7"
+
+class TrainingShot(NamedTuple):
+    """A shot to render."""
+
+    scene: str  # "random", "hard" or a .blend
+    seed: int
+    film: str  # of which it is a part
+    samples: str  # range of the samples per pixel that are drawn
+    target: int  # samples per pixel of the cleanest render
+
+
+def training_shots(scenes: Sequence[str]) -> Iterator[TrainingShot]:
+    """All shots, of two of each scene; a few hard ones take as long as ten others."""
+    for seed in range(20000, 20010):
+        placed = [scene for index, scene in enumerate(scenes) if seed % 5 == index % 5]
+        for scene in ("random", "hard", *placed):
+            yield TrainingShot(scene, seed, "640x360" if seed % 2 else "1280x720", "4-128", 256)
+    for seeds, samples, target in ((range(20700, 20721), "4-128", 128), (range(21000, 21049), "2-64", 64)):
+        for seed in seeds:
+            film = "1920x1080" if seed % 4 < 2 else "1280x720"
+            yield TrainingShot("hard" if seed % 2 else "random", seed, film, samples, target)
+
+
+CLIPS = "--reference --tile 0 --first-pass oidn-fast --window 7 --teacher quality"
 #: Settings of each preset: the larger a network, the longer a step takes.
 SCHEDULES = {
-    "fast": ["--window", 5, "--batch", 8, "--rate", 3e-5, "--steps", 5000],
-    "balanced": ["--window", 5, "--batch", 8, "--rate", 3e-5, "--steps", 5000],
-    "quality": ["--window", 7, "--batch", 4, "--rate", 2e-5, "--steps", 3800],
+    "fast": ["--window", 5, "--batch", 8, "--rate", 3e-5, "--steps", 1600],
+    "balanced": ["--window", 5, "--batch", 8, "--rate", 3e-5, "--steps", 1100],
+    "quality": ["--window", 7, "--batch", 4, "--rate", 2e-5, "--steps", 1100],
 }
 TRAIN = ["--init", "oidn", "--loss", "display", "--differences", 0.5, "--crop", 80]
 TRAIN += ["--backbone-rate", 1, "--warmup", 100, "--ema", 0.999, "--sets", 1]
@@ -46,6 +63,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("out", type=Path)
     parser.add_argument("--blender-python", default=sys.executable, help="a Python that has bpy")
+    parser.add_argument("--scene", action="append", default=[], help="a .blend; repeatable")
     parser.add_argument("--device", default="auto", help="as of ravg train")
     parser.add_argument("--untrained", action="store_true", help="write what the trainings begin with, and stop")
     options = parser.parse_args()
@@ -60,9 +78,12 @@ def main() -> int:
         subprocess.run([sys.executable, "-m", "hybrid.cli", *map(str, words)], check=True)
 
     shots, clips = options.out / "shots", options.out / "clips"
-    for kind, seed, count, film in SHOTS:
-        drawn = ["--film", film, "--seed", seed, "--shots", count, "--python", options.blender_python]
-        ravg("simulate", kind, "-o", shots, *RENDER, *drawn)
+    for shot in training_shots(options.scene):
+        folder = shots / f"{Path(shot.scene).stem}{shot.seed}"
+        moved = ["--camera", "random", "--movers", 2] if shot.scene.endswith(".blend") else []
+        levels = ["--spp", shot.samples, "--levels", f"target={shot.target},a=n,b=n/e", "--frames", "1-7"]
+        drawn = ["--seed", shot.seed, "--film", shot.film, "--size", "128x80", *levels, *moved]
+        ravg("simulate", shot.scene, "-o", folder, *drawn, "--python", options.blender_python)
     for shot in sorted(shots.iterdir()):
         if not (shot / "reference.0007.exr").exists():
             ravg("denoise", shot / "target.####.exr", "-o", shot / "reference.####.exr", "--preset", "quality")
