@@ -3,10 +3,11 @@
     python benchmarks/bench_scaling.py pixels    # 320×180 to 3840×2160
     python benchmarks/bench_scaling.py frames    # 1 to 300 frames of 320×180
     python benchmarks/bench_scaling.py window    # windows of 3 to 9 frames, with the network of `fast`
+    python benchmarks/bench_scaling.py jobs      # one process and several, `--frames 40` or so
     python benchmarks/bench_scaling.py cores     # the serial share (Linux)
 
 Runs are whole processes on the shot *pan* (`bench_shot.py`); each row but those of `cores` has the CPU seconds and
-the peak memory of one run. `cores` runs the same command on one and on two cores, `--pairs` times in turn. With s the
+the peak memory of one run, with several processes that of the largest. `cores` runs the same command on one and on two cores, `--pairs` times in turn. With s the
 serial and p the parallel seconds of a run, one core takes s + p and n cores s + p / n (Amdahl): two measured times
 give both. The model uses the run on two cores alone: a core that waits costs no CPU seconds, so a stage of W seconds
 and C CPU seconds has 2 W − C serial ones. It predicts C seconds on one core, to compare with those
@@ -30,6 +31,7 @@ from hybrid.records import read_records
 SCALES = (1, 2, 4, 6, 8, 12)  # times 320×180
 FRAMES = (1, 3, 10, 30, 100, 300)
 WINDOWS = (3, 5, 7, 9)
+JOBS = (1, 2, 4)
 
 
 def run(folder: Path, frames: int, scale: int, options: Sequence[str]) -> dict[str, float]:
@@ -86,11 +88,11 @@ def serial_share(command: Callable[[], dict[str, float]], out: Path, pairs: int)
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("over", choices=("pixels", "frames", "window", "cores"))
+    parser.add_argument("over", choices=("pixels", "frames", "window", "jobs", "cores"))
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--frames", type=int, default=5, help="of each run, but over frames (default: 5)")
     parser.add_argument("--scale", type=int, default=6, help="of 320×180, for window and cores (default: 6)")
-    parser.add_argument("--values", type=int, nargs="+", help="scales, frames or windows, in place of all")
+    parser.add_argument("--values", type=int, nargs="+", help="scales, frames, windows or jobs, in place of all")
     parser.add_argument("--pairs", type=int, default=3, help="of runs on one and two cores (default: 3)")
     options = parser.parse_args(argv)
     preset = ["--preset", options.preset]
@@ -101,11 +103,13 @@ def main(argv: list[str] | None = None) -> int:
             command = partial(run, folder, options.frames, options.scale, preset)
             print(json.dumps(serial_share(command, folder / "out", options.pairs)))
             return 0
-        for value in options.values or {"pixels": SCALES, "frames": FRAMES, "window": WINDOWS}[options.over]:
+        values = {"pixels": SCALES, "frames": FRAMES, "window": WINDOWS, "jobs": JOBS}
+        for value in options.values or values[options.over]:
             frames, scale = options.frames, 1 if options.over == "frames" else options.scale
             frames, scale = {"pixels": (frames, value), "frames": (value, 1)}.get(options.over, (frames, scale))
-            asked = network(folder, value) if options.over == "window" else preset
-            if asked is not preset:
+            asked = [*preset, "--jobs", str(value)] if options.over == "jobs" else preset
+            if options.over == "window":
+                asked = network(folder, value)
                 run(folder, 1, 1, asked)  # compiles loops for this length
             cost = run(folder, frames, scale, asked)
             print(json.dumps({options.over: value, **{key: round(each, 2) for key, each in cost.items()}}), flush=True)

@@ -4,9 +4,10 @@ import os
 import shlex
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,7 +17,8 @@ import typer
 
 from hybrid.commands import options as opt
 from hybrid.commands import shots
-from hybrid.commands.cluster import Chunk, arguments_of, run_on_cluster
+from hybrid.commands.chunks import Chunk, arguments_of, run_jobs
+from hybrid.commands.cluster import run_on_cluster
 from hybrid.commands.log import LOG, Progress, duration, log_file, one_line, print_table, printable, summarize
 from hybrid.files.layers import summarize_layers
 from hybrid.files.profile import ROLE_FACTS
@@ -24,6 +26,7 @@ from hybrid.files.sequences import format_frames
 from hybrid.files.shots import Shot, output_path
 from hybrid.first_pass import SPECS
 from hybrid.job import DenoiseOptions, Job, Paths, Step, check_paths
+from hybrid.memory import parse_size
 from hybrid.pipeline import Failed, Finished
 from hybrid.plan import NEURAL_STAGES, Plan, merge
 from hybrid.preview import check_png, check_preview, write_contact_sheet, write_preview
@@ -74,9 +77,10 @@ def denoise(
     max_pixels: int | None = None,
     scheduler: str | None = None,
     chunk: int = 10,
+    jobs: int = 1,
     **settings: Any,
 ) -> None:
-    """Denoise each view of a shot, here or on a cluster."""
+    """Denoise each view of a shot, in this process, in several, or on a cluster."""
     how = opt.take(opt.ReadOptions, settings)
     with opt.usage():
         options = DenoiseOptions(
@@ -86,8 +90,10 @@ def denoise(
             device=device,
             strict=how["strict"],
         )
-        if scheduler is not None and (options.budget is not None or options.breakdown is not None):
-            raise ValueError("--budget and --breakdown are of one machine, expected no --scheduler with them")
+        if (scheduler is not None or jobs > 1) and (options.budget is not None or options.breakdown is not None):
+            raise ValueError("--budget and --breakdown are of one process, expected no --scheduler or --jobs with them")
+        if scheduler is not None and jobs > 1:
+            raise ValueError("--jobs are processes on this machine, expected no --scheduler with them")
     read = shots.ShotInput(shot=shot, aovs=tuple(aov or ()), max_pixels=max_pixels, **how)
     request = Request(read, output, options, preview, contact_sheet, fps)
     if options.method == "network":
@@ -101,24 +107,37 @@ def denoise(
         if view:
             LOG.info(f"view {view}")
         here = shots.in_view(request, view)
-        if scheduler is None:
-            _denoise(here)
+        if scheduler is not None:
+            # A chunk that is run again, after its worker died, skips the frames that are finished.
+            run = partial(run_on_cluster, scheduler)
+            _denoise_in_chunks(context, here, view, lambda _: chunk, {"resume": True}, run)
+        elif jobs > 1:
+            # Chunks as long as possible: each computes its neighbours as well.
+            limit = options.max_memory and f"{parse_size(options.max_memory) // jobs / 2**20:.3f}M"
+            run = partial(run_jobs, jobs)
+            _denoise_in_chunks(context, here, view, lambda count: -(-count // jobs), {"max_memory": limit}, run)
         else:
-            _hand_out(context, here, view, scheduler, chunk)
+            _denoise(here)
 
 
-def _hand_out(context: typer.Context, request: Request, view: str, scheduler: str, size: int) -> None:
-    """Let a cluster denoise the shot, a chunk of its frames at a time."""
+def _denoise_in_chunks(
+    context: typer.Context,
+    request: Request,
+    view: str,
+    size_of: Callable[[int], int],
+    changes: Mapping[str, object],
+    run: Callable[[str, Mapping[str, Chunk]], None],
+) -> None:
+    """Denoise the shot, a chunk of its frames in a process, by this command with other parameters."""
     shot = request.shot.open()
     check_paths(shot, request.output, request.options, paths=request.paths)
-    parts = [shot.numbers[start : start + size] for start in range(0, len(shot.numbers), size)]
-    chunks = {}
-    for part in parts:
+    size, chunks = size_of(len(shot.numbers)), {}
+    for start in range(0, len(shot.numbers), size):
+        part = shot.numbers[start : start + size]
         name = format_frames(part)
-        # A chunk that is run again, after its worker died, skips the frames that are finished.
-        words = arguments_of(context, {"frames": name, "resume": True})
+        words = arguments_of(context, {**changes, "frames": name})
         chunks[name] = Chunk(shots.in_view(words, view), len(part))
-    run_on_cluster(scheduler, str(context.info_name), chunks)
+    run(str(context.info_name), chunks)
     if shot.missing:
         LOG.error(f"frames {format_frames(shot.missing)} were asked for and are not there")
         raise typer.Exit(1)

@@ -6,7 +6,8 @@ from typing import Any
 
 import typer
 
-from hybrid.commands.cluster import Chunk, arguments_of, run_on_cluster
+from hybrid.commands.chunks import Chunk, arguments_of
+from hybrid.commands.cluster import run_on_cluster
 from hybrid.commands.log import LOG, Progress
 from hybrid.commands.options import command, usage
 from hybrid.simulate.run import parse_center, parse_size, read_meta, samples_left, shots_of

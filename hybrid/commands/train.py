@@ -8,7 +8,8 @@ from typing import Annotated, Any, NamedTuple
 import typer
 
 from hybrid.commands import options as opt
-from hybrid.commands.cluster import Chunk, arguments_of, run_on_cluster
+from hybrid.commands.chunks import Chunk, arguments_of
+from hybrid.commands.cluster import run_on_cluster
 from hybrid.commands.log import LOG, Progress
 from hybrid.commands.shots import import_neural, log_cuts, parse_input, parse_layers, validate_renders
 from hybrid.files.replace import check_outputs

@@ -15,7 +15,7 @@ import pytest
 import typer
 
 from hybrid.cli import main
-from hybrid.commands.cluster import arguments_of
+from hybrid.commands.chunks import arguments_of
 from tests.commands import words_in
 from tests.hybrid.simulate.test_run import STUB
 from tests.hybrid.test_docs import said, transcript

@@ -1,0 +1,171 @@
+"""Run a command in chunks of frames or shots, each in a process of its own.
+
+A process returns all memory at its end, and fails alone. `hybrid.commands.cluster` runs chunks on other machines.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import typer
+
+from hybrid.commands.log import LOG, Progress
+from hybrid.runtime.interrupt import INTERRUPTED, interruptible
+from loops.parallel import thread_count
+
+# Parameters that concern the submitting process alone.
+NOT_PASSED_ON = (
+    "scheduler", "chunk", "jobs", "log_format", "log_file", "quiet", "verbose", "preview", "contact_sheet", "fps",
+)  # fmt: skip
+
+
+class Chunk(NamedTuple):
+    """A part of the work: arguments of its command, and its size in frames or samples."""
+
+    arguments: Sequence[str]
+    size: float
+
+
+def arguments_of(context: typer.Context, changes: Mapping[str, Any]) -> list[str]:
+    """Return the arguments of this command as they were given, with some parameters changed."""
+    words, positional = [str(context.info_name)], []
+    for parameter in context.command.params:
+        name = str(parameter.name)
+        value = changes.get(name, context.params.get(name))
+        if name in NOT_PASSED_ON or value is None or value is False or value == "":
+            continue
+        values = [str(item) for item in value] if isinstance(value, list | tuple) else [str(value)]
+        if parameter.param_type_name == "argument":
+            positional += values
+        elif value is True:
+            words.append(_longest(parameter.opts))
+        else:  # with "=", as a value may begin with a hyphen
+            words += [f"{_longest(parameter.opts)}={item}" for item in values]
+    return [*words, "--", *positional]
+
+
+def _longest(names: Sequence[str]) -> str:
+    return next(name for name in names if name.startswith("--"))
+
+
+class ChunkLog:
+    """Logs the progress and the warnings of all chunks, by the records of their processes."""
+
+    def __init__(self, title: str, chunks: Mapping[str, Chunk], unit: str) -> None:
+        self._chunks, self._shares = chunks, dict.fromkeys(chunks, 0.0)
+        self._bar = Progress(title, sum(chunk.size for chunk in chunks.values()), unit)
+        self._lock = threading.Lock()  # each chunk has a thread that reads its records
+        self._failed: list[str] = []
+
+    def add(self, name: str, record: Mapping[str, Any]) -> None:
+        """Log a warning of a chunk, or advance the bar by its progress."""
+        with self._lock:
+            if "percent" in record:
+                size = self._chunks[name].size
+                self._shares[name] = max(self._shares[name], record["percent"] / 100 * size)
+                if (gained := sum(self._shares.values()) - self._bar.done) > 0:
+                    self._bar.advance(gained, record["message"])
+            elif record["level"] == "warning":
+                LOG.warning(f"{name}: {record['message']}")
+
+    def end(self, name: str, fault: str) -> None:
+        """Log that a chunk is done, or its fault."""
+        if fault:
+            self._failed.append(name)
+            LOG.error(f"{name}: {fault}")
+        else:
+            self.add(name, {"percent": 100, "message": f"{name} done"})
+
+    def finish(self) -> None:
+        """Raise typer.Exit with 1 if a chunk has failed."""
+        if self._failed:
+            LOG.error(f"{len(self._failed)} of {len(self._chunks)} chunks were not made: {', '.join(self._failed)}")
+            raise typer.Exit(1)
+
+
+def log_stop() -> None:
+    """Log that Ctrl-C has stopped all chunks."""
+    LOG.error("stopped: what is finished is kept; the same command goes on from there")
+
+
+def run_jobs(jobs: int, title: str, chunks: Mapping[str, Chunk], unit: str = "frames") -> None:
+    """Run chunks, by name, on this machine, so many at a time, which share its cores, and log their progress.
+
+    Raises typer.Exit with 1 if a chunk failed, after all others ended, or with 130 for Ctrl-C.
+    """
+    log, stop = ChunkLog(title, chunks, unit), threading.Event()
+    threads = {name: str(max(thread_count() // jobs, 1)) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")}
+    with ThreadPoolExecutor(jobs) as pool:
+        tasks = {
+            pool.submit(run_command, chunk.arguments, stop.is_set, partial(log.add, name), environment=threads): name
+            for name, chunk in chunks.items()
+        }
+        try:
+            with interruptible(log_stop):
+                for task in as_completed(tasks):
+                    log.end(tasks[task], task.result())
+        except KeyboardInterrupt:
+            stop.set()
+            pool.shutdown(cancel_futures=True)
+            raise typer.Exit(INTERRUPTED) from None
+    log.finish()
+
+
+def run_command(
+    arguments: Iterable[str],
+    stopped: Callable[[], bool],
+    add: Callable[[Mapping[str, Any]], object],
+    *,
+    folder: str | Path | None = None,
+    environment: Mapping[str, str] = MappingProxyType({}),
+) -> str:
+    """Run a command of ravg in a process until it ends or is `stopped`; return its error, or "".
+
+    It has this process's environment and these variables too. `add` is called with each record of its log.
+    """
+    inherited = {key: value for key, value in os.environ.items() if key not in ("RAVG_SCHEDULER", "RAVG_LOG_FILE")}
+    search = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "PYTHONUTF8": "1"}
+    words = list(arguments)
+    words.insert(words.index("--"), "--log-format=json")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "hybrid.cli", *words],
+        cwd=folder,
+        env={**inherited, **search, **environment},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        encoding="utf-8",
+        errors="replace",
+    )
+
+    def watch() -> None:
+        while process.poll() is None:
+            if stopped():
+                process.terminate()
+                return
+            time.sleep(0.5)
+
+    threading.Thread(target=watch, daemon=True).start()
+    last = ""
+    for line in process.stderr or ():
+        try:
+            record = json.loads(line)
+            level = record["level"]
+        except (ValueError, TypeError, KeyError):  # of a library, or a traceback
+            last = line.strip() or last
+            continue
+        if level == "error":
+            last = record["message"]
+        add(record)
+    code = process.wait()
+    return "" if code == 0 else f"ended with {code}: {last}"

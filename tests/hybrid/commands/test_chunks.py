@@ -1,0 +1,107 @@
+"""Chunks of a shot in processes on this machine."""
+
+import signal
+import time
+
+import pytest
+
+from hybrid.cli import main
+from hybrid.commands import chunks
+from hybrid.commands.chunks import Chunk, run_jobs
+from tests.scenes import Scene
+
+FRAMES = 5
+OPTIONS = ["--preset", "draft"]
+
+
+@pytest.fixture(scope="module")
+def shot(tmp_path_factory):
+    return Scene(frames=FRAMES).write(tmp_path_factory.mktemp("shot") / "noisy")
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.glob("*.exr")}
+
+
+def test_several_processes_make_the_same_bytes_as_one(shot, tmp_path, capsys):
+    assert main(["denoise", str(shot), "-o", str(tmp_path / "one"), *OPTIONS]) == 0
+    capsys.readouterr()
+    preview = tmp_path / "look.png"
+    words = ["denoise", str(shot), "-o", str(tmp_path / "two"), *OPTIONS, "--jobs", "2", "--preview", str(preview)]
+    assert main(words) == 0
+    assert contents(tmp_path / "two") == contents(tmp_path / "one")
+    assert "5 of 5 frames, 100 %" in capsys.readouterr().err
+    assert preview.is_file()
+    assert len(list((tmp_path / "two" / "ravg").glob("*.json"))) == 2  # a record of each process
+
+
+def test_processes_share_frames_cores_and_memory(shot, tmp_path, monkeypatch):
+    started = []
+
+    def run(arguments, stopped, add, *, environment):
+        started.append((sorted(word for word in arguments if word[:8] in ("--frames", "--max-me")), environment))
+        return ""
+
+    monkeypatch.setattr(chunks, "run_command", run)
+    monkeypatch.setattr(chunks, "thread_count", lambda: 9)
+    words = ["denoise", str(shot), "-o", str(tmp_path), *OPTIONS, "--jobs", "2", "--max-memory", "1G"]
+    assert main(words) == 0
+    threads = {"NUMBA_NUM_THREADS": "4", "OMP_NUM_THREADS": "4"}
+    assert sorted(started, key=str) == [
+        (["--frames=1001-1003", "--max-memory=512.000M"], threads),
+        (["--frames=1004-1005", "--max-memory=512.000M"], threads),
+    ]
+
+
+@pytest.mark.posix
+def test_the_process_has_the_variables_and_hands_on_its_log(monkeypatch):
+    records = []
+    monkeypatch.setenv("RAVG_LOG_FILE", "all.log")
+    popen = chunks.subprocess.Popen
+
+    def start(words, **options):
+        script = 'echo \'{"level": "warning", "message": "odd"}\' >&2; echo "$THREADS$RAVG_LOG_FILE" >&2; exit 3'
+        return popen(["sh", "-c", script], **options)
+
+    monkeypatch.setattr(chunks.subprocess, "Popen", start)
+    fault = chunks.run_command(["denoise", "--", "shot"], lambda: False, records.append, environment={"THREADS": "4"})
+    assert fault == "ended with 3: 4"
+    assert records == [{"level": "warning", "message": "odd"}]
+
+
+def test_a_chunk_fails_alone(shot, tmp_path, capsys):
+    broken = tmp_path / "noisy"
+    broken.mkdir()
+    for path in shot.glob("*.exr"):
+        data = path.read_bytes()
+        (broken / path.name).write_bytes(data[: len(data) // 2] if "1005" in path.name else data)
+    words = ["denoise", str(broken), "-o", str(tmp_path / "out"), *OPTIONS, "--no-stages", "stabilize"]
+    assert main([*words, "--jobs", "5"]) == 1
+    said = capsys.readouterr().err
+    assert "error: 1005: ended with 1" in said
+    assert "chunks were not made: " in said
+    assert "shot.1001.exr" in contents(tmp_path / "out")
+
+
+def test_ctrl_c_stops_all_processes(monkeypatch):
+    ended = []
+
+    def run(arguments, stopped, add, *, environment):
+        if arguments == ["second"]:
+            signal.raise_signal(signal.SIGINT)
+        while not stopped():
+            time.sleep(0.01)
+        ended.append(arguments)
+        return "stopped"
+
+    monkeypatch.setattr(chunks, "run_command", run)
+    with pytest.raises(chunks.typer.Exit) as exit_:
+        run_jobs(2, "denoise", {name: Chunk([name], 1) for name in ("first", "second", "third")})
+    assert exit_.value.exit_code == 130
+    assert sorted(ended) == [["first"], ["second"]]  # the third never began
+
+
+def test_one_machine_and_one_process_at_a_time_are_asked_for(shot, tmp_path, capsys):
+    for words in (["--scheduler", "tcp://here:1"], ["--budget", "10s"]):
+        assert main(["denoise", str(shot), "-o", str(tmp_path), "--jobs", "2", *words]) == 2
+        assert "--jobs" in capsys.readouterr().err
