@@ -6,12 +6,12 @@
     python benchmarks/bench_scaling.py jobs      # one process and several, `--frames 40` or so
     python benchmarks/bench_scaling.py cores     # the serial share (Linux)
 
-Runs are whole processes on the shot *pan* (`bench_shot.py`); each row but those of `cores` has the CPU seconds and
-the peak memory of one run, with several processes that of the largest. `cores` runs the same command on one and on two cores, `--pairs` times in turn. With s the
-serial and p the parallel seconds of a run, one core takes s + p and n cores s + p / n (Amdahl): two measured times
-give both. The model uses the run on two cores alone: a core that waits costs no CPU seconds, so a stage of W seconds
-and C CPU seconds has 2 W − C serial ones. It predicts C seconds on one core, to compare with those
-measured. Seconds on 16 and 64 cores are computed, not measured.
+Runs are whole processes on the shot *pan* (`bench_shot.py`); each row but those of `cores` has the CPU seconds and the
+peak memory of one run, with several processes that of the largest. `cores` runs the same command on one and on two
+cores, `--pairs` times in turn. With s the serial and p the parallel seconds of a run, one core takes s + p and n cores
+s + p / n (Amdahl): two measured times give both. The model uses the run on two cores alone: a core that waits costs no
+CPU seconds, so a stage of W seconds and C CPU seconds has 2 W − C serial ones. It predicts C seconds on one core, to
+compare with those measured. Seconds on 16 and 64 cores are computed, not measured.
 """
 
 import argparse
