@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -105,18 +105,26 @@ def run_jobs(jobs: int, title: str, chunks: Mapping[str, Chunk], unit: str = "fr
     log, stop = ChunkLog(title, chunks, unit), threading.Event()
     threads = {name: str(max(thread_count() // jobs, 1)) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")}
     with ThreadPoolExecutor(jobs) as pool:
-        tasks = {
-            pool.submit(run_command, chunk.arguments, stop.is_set, partial(log.add, name), environment=threads): name
-            for name, chunk in chunks.items()
-        }
         try:
             with interruptible(log_stop):
-                for task in as_completed(tasks):
-                    log.end(tasks[task], task.result())
-        except KeyboardInterrupt:
+                tasks = {
+                    pool.submit(
+                        run_command, chunk.arguments, stop.is_set, partial(log.add, name), environment=threads
+                    ): name
+                    for name, chunk in chunks.items()
+                }
+                waiting = set(tasks)
+                while waiting:
+                    # Windows delivers Ctrl-C only between two waits.
+                    done, waiting = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
+                    for task in done:
+                        log.end(tasks[task], task.result())
+        except BaseException as error:  # or the pool would wait for the other chunks
             stop.set()
             pool.shutdown(cancel_futures=True)
-            raise typer.Exit(INTERRUPTED) from None
+            if isinstance(error, KeyboardInterrupt):
+                raise typer.Exit(INTERRUPTED) from None
+            raise
     log.finish()
 
 

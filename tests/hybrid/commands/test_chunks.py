@@ -1,6 +1,8 @@
 """Chunks of a shot in processes on this machine."""
 
+import os
 import signal
+import threading
 import time
 
 import pytest
@@ -83,18 +85,25 @@ def test_a_chunk_fails_alone(shot, tmp_path, capsys):
     assert "shot.1001.exr" in contents(tmp_path / "out")
 
 
+@pytest.mark.posix
 def test_ctrl_c_stops_all_processes(monkeypatch):
-    ended = []
+    ended, begun, wait = [], threading.Event(), chunks.wait
 
     def run(arguments, stopped, add, *, environment):
         if arguments == ["second"]:
-            signal.raise_signal(signal.SIGINT)
+            begun.wait()
+            os.kill(os.getpid(), signal.SIGINT)
         while not stopped():
             time.sleep(0.01)
         ended.append(arguments)
         return "stopped"
 
+    def wait_for_chunks(*tasks, **options):
+        begun.set()
+        return wait(*tasks, **options)
+
     monkeypatch.setattr(chunks, "run_command", run)
+    monkeypatch.setattr(chunks, "wait", wait_for_chunks)
     with pytest.raises(chunks.typer.Exit) as exit_:
         run_jobs(2, "denoise", {name: Chunk([name], 1) for name in ("first", "second", "third")})
     assert exit_.value.exit_code == 130
