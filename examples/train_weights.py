@@ -1,7 +1,7 @@
 """A training of the final stage from OIDN's weights: render shots, make clips of them, train each preset.
 
     python examples/train_weights.py OUT --blender-python blender/bin/python --scene a.blend --scene b.blend
-    python examples/train_weights.py OUT --untrained    # the initial weights
+    python examples/train_weights.py OUT --untrained    # the initial weights, which ship
 
 The shots are drawn from seeds (`ravg simulate random` and `hard`, and two of each scene) and reproducible; no shot of
 the evaluation or of the tuning of ravg is among them. Each has a render of many samples. Its frames, denoised by
@@ -51,9 +51,9 @@ def training_shots(scenes: Sequence[str]) -> Iterator[TrainingShot]:
 CLIPS = "--reference --tile 0 --first-pass oidn-fast --window 7 --teacher quality"
 #: Settings of each preset: the larger a network, the longer a step takes.
 SCHEDULES = {
-    "fast": ["--window", 5, "--batch", 8, "--rate", 3e-5, "--steps", 1600],
-    "balanced": ["--window", 5, "--batch", 8, "--rate", 3e-5, "--steps", 1100],
-    "quality": ["--window", 7, "--batch", 4, "--rate", 2e-5, "--steps", 1100],
+    "fast": ["--window", 5, "--batch", 8, "--rate", 3e-5, "--steps", 2400],
+    "balanced": ["--window", 5, "--batch", 8, "--rate", 3e-5, "--steps", 2400],
+    "quality": ["--window", 7, "--batch", 4, "--rate", 2e-5, "--steps", 2400],
 }
 TRAIN = ["--init", "oidn", "--loss", "display", "--differences", 0.5, "--crop", 80]
 TRAIN += ["--backbone-rate", 1, "--warmup", 100, "--ema", 0.999, "--sets", 1]

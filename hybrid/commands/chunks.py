@@ -23,9 +23,7 @@ from hybrid.runtime.interrupt import INTERRUPTED, interruptible
 from loops.parallel import thread_count
 
 # Parameters that concern the submitting process alone.
-NOT_PASSED_ON = (
-    "scheduler", "chunk", "jobs", "log_format", "log_file", "quiet", "verbose", "preview", "contact_sheet", "fps",
-)  # fmt: skip
+NOT_PASSED_ON = ("scheduler", "chunk", "log_format", "log_file", "quiet", "verbose", "preview", "contact_sheet", "fps")
 
 
 class Chunk(NamedTuple):

@@ -109,13 +109,14 @@ def denoise(
         here = shots.in_view(request, view)
         if scheduler is not None:
             # A chunk that is run again, after its worker died, skips the frames that are finished.
-            run = partial(run_on_cluster, scheduler)
-            _denoise_in_chunks(context, here, view, lambda _: chunk, {"resume": True}, run)
+            _denoise_in_chunks(
+                context, here, view, lambda _: chunk, {"resume": True}, partial(run_on_cluster, scheduler)
+            )
         elif jobs > 1:
             # Chunks as long as possible: each computes its neighbours as well.
             limit = options.max_memory and f"{parse_size(options.max_memory) // jobs / 2**20:.3f}M"
-            run = partial(run_jobs, jobs)
-            _denoise_in_chunks(context, here, view, lambda count: -(-count // jobs), {"max_memory": limit}, run)
+            changes = {"max_memory": limit, "jobs": None}
+            _denoise_in_chunks(context, here, view, lambda count: -(-count // jobs), changes, partial(run_jobs, jobs))
         else:
             _denoise(here)
 

@@ -41,7 +41,7 @@ def test_processes_share_frames_cores_and_memory(shot, tmp_path, monkeypatch):
     started = []
 
     def run(arguments, stopped, add, *, environment):
-        started.append((sorted(word for word in arguments if word[:8] in ("--frames", "--max-me")), environment))
+        started.append((sorted(word for word in arguments if word[:6] in ("--fram", "--max-", "--jobs")), environment))
         return ""
 
     monkeypatch.setattr(chunks, "run_command", run)
