@@ -20,7 +20,6 @@ import typer
 
 from hybrid.commands.log import LOG, Progress
 from hybrid.runtime.interrupt import INTERRUPTED, interruptible
-from loops.parallel import thread_count
 
 # Parameters that concern the submitting process alone.
 NOT_PASSED_ON = ("scheduler", "chunk", "log_format", "log_file", "quiet", "verbose", "preview", "contact_sheet", "fps")
@@ -100,6 +99,8 @@ def run_jobs(jobs: int, title: str, chunks: Mapping[str, Chunk], unit: str = "fr
 
     Raises typer.Exit with 1 if a chunk failed, after all others ended, or with 130 for Ctrl-C.
     """
+    from loops.parallel import thread_count  # here, since numba takes a second to load
+
     log, stop = ChunkLog(title, chunks, unit), threading.Event()
     threads = {name: str(max(thread_count() // jobs, 1)) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")}
     with ThreadPoolExecutor(jobs) as pool:

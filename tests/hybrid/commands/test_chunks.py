@@ -10,6 +10,7 @@ import pytest
 from hybrid.cli import main
 from hybrid.commands import chunks
 from hybrid.commands.chunks import Chunk, run_jobs
+from loops import parallel
 from tests.scenes import Scene
 
 FRAMES = 5
@@ -45,7 +46,7 @@ def test_processes_share_frames_cores_and_memory(shot, tmp_path, monkeypatch):
         return ""
 
     monkeypatch.setattr(chunks, "run_command", run)
-    monkeypatch.setattr(chunks, "thread_count", lambda: 9)
+    monkeypatch.setattr(parallel, "thread_count", lambda: 9)
     words = ["denoise", str(shot), "-o", str(tmp_path), *OPTIONS, "--jobs", "2", "--max-memory", "1G"]
     assert main(words) == 0
     threads = {"NUMBA_NUM_THREADS": "4", "OMP_NUM_THREADS": "4"}
