@@ -56,7 +56,7 @@ class _FirstRun(event.Listener):
         if self.begun:
             return
         self.begun = True
-        LOG.info("compiling for this processor: about ten seconds, in the first run only")
+        LOG.info("compiling for this processor, in the first run only: ten seconds to a minute")
         folder = getattr(event.data["dispatcher"]._cache, "cache_path", None)  # None without a cache
         if folder and not folder.startswith(os.devnull):
             options: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
@@ -122,7 +122,7 @@ def _temporary_folder() -> str | None:
         tempfile.TemporaryFile(dir=folder).close()
     except OSError:
         LOG.warning(
-            "compiled loops cannot be kept anywhere: each run starts fifteen seconds later; "
+            "compiled loops cannot be kept anywhere: each run starts up to a minute later; "
             "set NUMBA_CACHE_DIR to a folder that can be written to"
         )
         return None
