@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from network.cpu.winograd import can_transform, convolve_transformed
+
 # Types for which oneDNN has the fused operation on this processor; none where torch was built without oneDNN.
 _FUSED: frozenset[torch.dtype] = frozenset()
 if torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_convolution_pointwise"):
@@ -31,6 +33,8 @@ def convolve(
         result = functional.conv2d(x, weight, bias, padding=1)
         result = result if added is None else added.add_(result)
         return torch.relu_(result) if relu else result
+    if can_transform(x, weight):
+        return convolve_transformed(x, weight, bias, added, relu=relu)
     one, name, rest = [1, 1], "relu" if relu else None, (list[float](), "")
     operation = weight, bias, one, one, one, 1  # padding, stride and dilation; groups
     if added is None:

@@ -1,0 +1,87 @@
+"""A convolution by values at points gives the sum of products."""
+
+# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
+
+from __future__ import annotations
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from torch.nn import functional
+
+from loops.parallel import limit_loops, thread_count
+from network.cpu import winograd
+from network.cpu.convolution import convolve
+from network.cpu.winograd import can_transform, convolve_transformed
+
+pytestmark = pytest.mark.neural
+
+
+def layers(size: tuple[int, int], channels: int, outputs: int, batch: int = 1) -> list[torch.Tensor]:
+    random = torch.Generator().manual_seed(sum(size))
+    x = torch.randn(batch, channels, *size, generator=random).contiguous(memory_format=torch.channels_last)
+    weight = torch.randn(outputs, channels, 3, 3, generator=random) / (9 * channels) ** 0.5
+    bias, added = torch.randn(outputs, generator=random), torch.randn(batch, outputs, *size, generator=random)
+    return [x, weight, bias, added.contiguous(memory_format=torch.channels_last)]
+
+
+@pytest.mark.parametrize("relu", [True, False])
+@pytest.mark.parametrize(
+    ("size", "channels", "outputs"),
+    [((1, 1), 3, 2), ((1, 9), 5, 7), ((8, 4), 64, 32), ((13, 31), 12, 48), ((5, 300), 128, 64), ((9, 1100), 8, 16)],
+)
+def test_it_is_the_sum_of_products(size: tuple[int, int], channels: int, outputs: int, relu: bool) -> None:
+    """Sizes with and without a rest beside the tiles, in one and in several chunks."""
+    x, weight, bias, added = layers(size, channels, outputs, batch=2)
+    plain = functional.conv2d(x.double(), weight.double(), padding=1)
+    shifted = plain + bias.double()[:, None, None] + added.double()
+    with torch.no_grad():
+        bare = convolve_transformed(x, weight, None, relu=relu)
+        found = convolve_transformed(x, weight, bias, added, relu=relu)
+    if relu:
+        plain, shifted = torch.relu(plain), torch.relu(shifted)
+    # Sums of up to 1,152 products of float32, of about 1.
+    torch.testing.assert_close(bare.double(), plain, rtol=0, atol=1e-5)
+    torch.testing.assert_close(found.double(), shifted, rtol=0, atol=1e-5)
+    assert found.data_ptr() == added.data_ptr()
+
+
+def test_it_rounds_no_more_than_the_sum_of_products() -> None:
+    """With the usual points 0, ±1, ±2 the error is several times as large."""
+    x, weight, bias, _ = layers((64, 96), 64, 64)
+    exact = functional.conv2d(x.double(), weight.double(), bias.double(), padding=1)
+    with torch.no_grad():
+        found = convolve_transformed(x, weight, bias, relu=False)
+    direct = functional.conv2d(x, weight, bias, padding=1)
+    error, usual = (float((layer.double() - exact).square().mean().sqrt()) for layer in (found, direct))
+    assert error < 2 * usual
+
+
+def test_the_number_of_threads_changes_no_bit() -> None:
+    x, weight, bias, _ = layers((21, 900), 16, 24)
+    before, found = thread_count(), []
+    try:
+        for count in (1, 2, 5):
+            limit_loops(count)
+            with torch.no_grad():
+                found.append(convolve_transformed(x, weight, bias, relu=True))
+    finally:
+        limit_loops(before)
+    assert torch.equal(found[0], found[1])
+    assert torch.equal(found[0], found[2])
+
+
+def test_large_layers_of_float32_take_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    x, weight, bias, _ = layers((16, 24), 8, 8)
+    with torch.no_grad():
+        assert not can_transform(x, weight)
+        monkeypatch.setattr(winograd, "_FEWEST_PRODUCTS", 8 * 8 * 16 * 24)
+        assert can_transform(x, weight)
+        assert not can_transform(x.bfloat16(), weight.bfloat16())
+        assert not can_transform(x[:, :, :15], weight)
+        wide = torch.randn(129, 8, 3, 3)
+        assert not can_transform(x, wide)
+        expected = convolve_transformed(x, weight, bias, relu=True)
+        assert torch.equal(convolve(x, weight, bias), expected)
+    assert not can_transform(x, weight)  # with gradients
