@@ -74,6 +74,7 @@ def test_the_number_of_threads_changes_no_bit() -> None:
 
 def test_large_layers_of_float32_take_it(monkeypatch: pytest.MonkeyPatch) -> None:
     x, weight, bias, _ = layers((16, 24), 8, 8)
+    monkeypatch.setattr(winograd, "_PAYS", True)
     with torch.no_grad():
         assert not can_transform(x, weight)
         monkeypatch.setattr(winograd, "_FEWEST_PRODUCTS", 8 * 8 * 16 * 24)
@@ -84,4 +85,7 @@ def test_large_layers_of_float32_take_it(monkeypatch: pytest.MonkeyPatch) -> Non
         assert not can_transform(x, wide)
         expected = convolve_transformed(x, weight, bias, relu=True)
         assert torch.equal(convolve(x, weight, bias), expected)
+        monkeypatch.setattr(winograd, "_PAYS", False)
+        assert not can_transform(x, weight)
+        monkeypatch.setattr(winograd, "_PAYS", True)
     assert not can_transform(x, weight)  # with gradients
