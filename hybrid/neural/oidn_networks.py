@@ -22,7 +22,7 @@ from network.oidn_weights import load_oidn
 from network.robust_unet import RobustUNet
 from network.unet import OidnUNet, denoise_albedo, denoise_color, denoise_normal
 
-HALO = 112  # pixels of context around a tile: nothing farther away changes an image, with any of the networks
+HALO = 112  # pixels of context around a tile: nothing farther away changes more than the last bits of an image
 TILE = 2048  # side of a tile, so that memory does not grow with the frame: 1920×1080 is one, 3840×2160 are four
 
 
