@@ -46,9 +46,6 @@ def prepare_libraries() -> None:
     os.environ.setdefault("NUMBA_CACHE_LOCATOR_CLASSES", CACHE_LOCATORS)
     # Straight-line code for several channels becomes one operation: a bicubic warp takes 0.75 of the time.
     os.environ.setdefault("NUMBA_SLP_VECTORIZE", "1")
-    # Loops multiply matrices on threads of their own (`network.cpu.winograd`): with those of OpenBLAS as well,
-    # `quality` took a tenth more CPU time.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     let_waiting_threads_sleep()
 
 

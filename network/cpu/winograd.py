@@ -1,196 +1,254 @@
-"""A 3×3 convolution with a quarter of the multiplications, for inference in float32 on CPUs.
+"""Convolutions with a quarter of the multiplications, for inference in float32 on CPUs.
 
-Winograd's minimal filtering F(4×4, 3×3) makes 4×4 results of 6×6 features with 36 multiplications for two channels,
-where the sum of products takes 144: features and weights are polynomials, which are multiplied by their values at six
-points. Lavin and Gray 2016, "Fast Algorithms for Convolutional Neural Networks", https://arxiv.org/abs/1509.09308.
+Winograd's minimal filtering makes 4×4 results of 3×3 taps with 36 multiplications for two channels, where the sum of
+products takes 144, and of 2×2 taps with 25 in place of 64: features and taps are polynomials, which are multiplied by
+their values at a few points. Lavin and Gray 2016, "Fast Algorithms for Convolutional Neural Networks",
+https://arxiv.org/abs/1509.09308. oneDNN has no such convolution on x86.
 
-The values are multiplied as matrices, by BLAS. oneDNN has no such convolution on x86: `quality` takes 0.92 of its CPU
-time at 1920×1080 on a Zen 3 (four pairs of runs, 0.88 to 0.98). All features of a tile take part in the rounding of
-each result: with `quality`, a pixel changes the last bits of others within 126 pixels, where it is 96 otherwise.
+It takes 0.4 to 0.6 of oneDNN's time on a Zen 3, less the more channels there are. All features of a tile take part in
+the rounding of each result.
 """
 
 from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
+from numba import njit, types
+from numba.extending import intrinsic
 from torch import Tensor
 
 from loops.parallel import Floats, run_bands
+from network.cpu.vectors import COLUMNS, LANES, PAYS, ROWS, Code, multiply_block
 
-_SIZE, _STEP = 6, 4  # features and results on a side of a tile
-# The points are 0, ±a, ±b and infinity. With these, rounding errors are at most twice those of the sum of products;
-# with the usual points 0, ±1 and ±2 they are four times as large.
-_A, _B = 0.5**0.5, 2**0.5
-_POINTS = (0.0, _A, -_A, _B, -_B)
-# Values of a polynomial at the points → its coefficients, one row each.
-_COEFFICIENTS = np.array([[*(p**n for p in _POINTS), float(n == _STEP - 1)] for n in range(_STEP)], np.float32)
-# On processors with AVX-512, where oneDNN multiplies twice as many numbers at a time, this was not measured.
-_PAYS = torch.backends.cpu.get_cpu_capability() == "AVX2"
-# With more channels too few tiles fit a cache for a product of matrices.
-_MOST_CHANNELS = 128
-# Fewest products of two channels: layers of 64 channels in the largest strips. With fewer, oneDNN is as fast.
-_FEWEST_PRODUCTS = 2**29
-_VALUES = 4096  # of the features of all tiles that are transformed together, for each of the places in a tile
-# Numbers between two rows of features, and between two places in all tiles. Constants, since loops over numbers at
-# unknown distances are not vectorised; no powers of two, whose multiples share a few lines of a cache.
-_ROW = 4 * _VALUES + 4 * _MOST_CHANNELS + 16
-_PLACE = _VALUES + 16
-
-_A1, _A2, _A3 = (np.float32(_A**n) for n in range(1, 4))
-_B1, _B2, _B3 = (np.float32(_B**n) for n in range(1, 4))
-_PRODUCT, _SUM = np.float32(_A**2 * _B**2), np.float32(_A**2 + _B**2)
-_UINT = np.uintp  # numba tests signed indices for counting from the end
+_STEP = 4  # results on a side of a tile
+# Points by the number of taps, beside infinity; opposite ones are neighbours and share sums. Rounding errors are 1.8
+# and 3.3 times those of the sum of products; with the usual points 0, ±1, ±2 and 0, ±1, 2 they are 3.8 and 4.8 times.
+_POINTS = {3: (0.0, 0.5**0.5, -(0.5**0.5), 2**0.5, -(2**0.5)), 2: (0.0, 0.75, -0.75, 2.0)}
+# Fewest products of two channels, those of 32 channels at 640×50, which take 0.6 of oneDNN's time.
+_FEWEST_PRODUCTS = 2**25
+# Features of the tiles that are transformed together, in each of their places: with their products they fit a cache.
+_VALUES = 768
+_PADDING = 16  # numbers between places, whose distance would often be a power of two: those share lines of a cache
 
 
 def can_transform(x: Tensor, weight: Tensor) -> bool:
-    """Whether `convolve_transformed` takes features ``(N, C, H, W)``, and saves time: float32, no gradients, AVX2."""
+    """Whether `convolve_transformed` takes features ``(N, C, H, W)`` and taps ``(O, C, K, K)``, and saves time."""
     return (
-        _PAYS
+        PAYS
         and x.dtype == weight.dtype == torch.float32
         and x.device.type == "cpu"
         and not torch.is_grad_enabled()
-        and max(weight.shape[:2]) <= _MOST_CHANNELS
-        and len(weight) * x[0].numel() >= _FEWEST_PRODUCTS
+        and len(weight) % COLUMNS == 0
+        and x.shape[1] % LANES == 0
+        and len(weight) * x.numel() >= _FEWEST_PRODUCTS
     )
 
 
 def convolve_transformed(
     x: Tensor, weight: Tensor, bias: Tensor | None, added: Tensor | None = None, *, relu: bool
 ) -> Tensor:
-    """Convolve ``(N, C, H, W)`` by ``(O, C, 3, 3)``, add, overwriting `added` (channels last), apply a ReLU.
+    """Convolve ``(N, C, H, W)`` by ``(O, C, K, K)``, add, overwriting `added` (channels last), apply a ReLU.
 
-    C and O are at most 128. Features beyond the borders count as 0. The result is channels last.
+    C is a multiple of 8, O of 16, K is 3 or 2. Features beyond the borders count as 0, with K = 2 those of one row and
+    column on each side: the result is then a row and a column larger. It is channels last.
     """
-    count, _, height, width = x.shape
     pixels = x.permute(0, 2, 3, 1).contiguous().numpy()
+    (outputs, channels, taps), count = weight.shape[:3], len(x)
+    height, width = (length + 3 - taps for length in x.shape[2:])
+    kept = added is not None
     if added is None:
-        result = np.zeros((count, height, width, len(weight)), np.float32)
-    else:
-        result = added.permute(0, 2, 3, 1).numpy()
-    offset = np.zeros(len(weight), np.float32) if bias is None else bias.numpy()
+        added = torch.empty(count, outputs, height, width, memory_format=torch.channels_last)
+    result = added.permute(0, 2, 3, 1).numpy()
+    offset = np.zeros(outputs, np.float32) if bias is None else bias.numpy()
     tiles = -(-width // _STEP)
-    chunks = -(-tiles // (_VALUES // max(weight.shape[:2])))
+    chunks = -(-tiles // (ROWS * max(_VALUES // max(outputs, channels) // ROWS, 1)))
     together = -(-tiles // chunks)  # as many in each chunk
-    floor, kept = np.float32(0 if relu else -np.inf), np.float32(added is not None)
+    floor = np.float32(0 if relu else -np.inf)
+    values = _transform_weight(weight), offset
     units = count * -(-height // _STEP) * chunks
-    run_bands(_convolve, units, pixels, _transform_weight(weight), offset, floor, kept, result, together)
-    return torch.from_numpy(result).permute(0, 3, 1, 2)
+    run_bands(_convolve, units, taps, pixels, *values, floor, kept, result, together)
+    return added
 
 
 def _transform_weight(weight: Tensor) -> Floats:
-    """Values of weights ``(O, C, 3, 3)`` at the points, over the products of their distances: ``(36, C, O)``."""
-    matrix = np.zeros((_SIZE, 3))
-    for n, point in enumerate(_POINTS):
-        distances = np.prod([point - other for other in _POINTS if other != point])
-        matrix[n] = point ** np.arange(3) / distances
+    """Values of taps ``(O, C, K, K)`` at the points, over products of their distances: places, O / 16, C, 16."""
+    outputs, channels, taps, _ = weight.shape
+    points = _POINTS[taps]
+    matrix = np.zeros((len(points) + 1, taps))
+    for n, point in enumerate(points):
+        matrix[n] = point ** np.arange(taps) / np.prod([point - other for other in points if other != point])
     matrix[-1, -1] = 1
-    taps = weight.permute(2, 3, 1, 0).numpy().reshape(9, -1)
-    values: Floats = (np.kron(matrix, matrix) @ taps).astype(np.float32)
-    return values.reshape(_SIZE**2, weight.shape[1], weight.shape[0])
+    rows = torch.from_numpy(np.kron(matrix, matrix))
+    values = (rows @ weight.permute(2, 3, 1, 0).reshape(taps**2, -1).double()).float()
+    blocks = values.reshape(len(rows), channels, outputs // COLUMNS, COLUMNS)
+    result: Floats = blocks.transpose(1, 2).reshape(-1).numpy()
+    return result
 
 
-# Inlined, since distances between places have to be constants.
-@njit(nogil=True, forceinline=True)
-def _evaluate(source: Any, start: Any, stride: Any, length: Any, target: Any, place: Any, distance: Any) -> None:
-    """Write the values at the points of polynomials, whose coefficients are `stride` apart."""
-    s1, s2, s3, s4, s5 = stride, _UINT(2) * stride, _UINT(3) * stride, _UINT(4) * stride, _UINT(5) * stride
-    for p in range(length):
-        n = start + p
-        d0, d1, d2 = source[n], source[n + s1], source[n + s2]
-        d3, d4, d5 = source[n + s3], source[n + s4], source[n + s5]
-        even_a, odd_a = d4 - _B2 * d2, _A1 * (d3 - _B2 * d1)
-        even_b, odd_b = d4 - _A2 * d2, _B1 * (d3 - _A2 * d1)
-        n = place + p
-        target[n] = _PRODUCT * d0 - _SUM * d2 + d4
-        target[n + distance] = even_a + odd_a
-        target[n + _UINT(2) * distance] = even_a - odd_a
-        target[n + _UINT(3) * distance] = even_b + odd_b
-        target[n + _UINT(4) * distance] = even_b - odd_b
-        target[n + _UINT(5) * distance] = _PRODUCT * d1 - _SUM * d3 + d5
+def _evaluate(code: Code, points: tuple[float, ...], coefficients: list[Any]) -> list[Any]:
+    """Values of polynomials at the points and at infinity, each times the products of distances to the other points."""
+    values: list[Any] = []
+    while (n := len(values)) < len(points):
+        others = [point for point in points if abs(point) != abs(points[n])]
+        if n and points[n + 1 : n + 2] == (-points[n],):
+            factors = _polynomial(others, len(coefficients))
+            moved = code.combine([0.0, *factors[:-1]], coefficients)
+            scaled = code.combine([points[n] * factor for factor in factors], coefficients)
+            values += [code.add(moved, scaled), code.subtract(moved, scaled)]
+        else:
+            values.append(code.combine(_polynomial(others, len(coefficients)), coefficients))
+    return [*values, code.combine(_polynomial(points, len(coefficients)), coefficients)]
 
 
-@njit(nogil=True, forceinline=True)
-def _interpolate(values: Any, length: Any, target: Any, place: Any) -> None:
-    """Write the coefficients of polynomials from their values at the points."""
-    for p in range(length):
-        a, b = values[p + _UINT(_PLACE)], values[p + _UINT(2 * _PLACE)]
-        c, d = values[p + _UINT(3 * _PLACE)], values[p + _UINT(4 * _PLACE)]
-        even_a, odd_a, even_b, odd_b = a + b, a - b, c + d, c - d
-        n = place + p
-        target[n] = values[p] + even_a + even_b
-        target[n + _UINT(_PLACE)] = _A1 * odd_a + _B1 * odd_b
-        target[n + _UINT(2 * _PLACE)] = _A2 * even_a + _B2 * even_b
-        target[n + _UINT(3 * _PLACE)] = _A3 * odd_a + _B3 * odd_b + values[p + _UINT(5 * _PLACE)]
+def _polynomial(roots: Any, length: int) -> list[float]:
+    """Coefficients of the polynomial with these roots, from that of 1 on, exactly 0 where they round to it."""
+    factors = np.zeros(length)
+    factors[: len(roots) + 1] = np.poly(roots)[::-1]
+    return [float(x) for x in np.where(abs(factors) < 1e-12, 0, factors)]
 
 
-@njit(nogil=True, forceinline=True)
-def _finish(
-    values: Any, source: Any, length: Any, factors: Any, target: Any, place: Any, bias: Any, floor: Any, kept: Any
-) -> None:
-    """Write a pixel: one coefficient of values in six rows, the bias, `kept` times what is there, at least `floor`."""
-    f0, f1, f2, f3, f4, f5 = factors
-    for c in range(length):
-        n = source + c
-        a, b = values[n + _UINT(4 * _PLACE)], values[n + _UINT(8 * _PLACE)]
-        total = f0 * values[n] + f1 * a + f2 * b
-        a, b = values[n + _UINT(12 * _PLACE)], values[n + _UINT(16 * _PLACE)]
-        total += f3 * a + f4 * b + f5 * values[n + _UINT(20 * _PLACE)]
-        target[place + c] = max(total + (bias[c] + kept * target[place + c]), floor)
+def _interpolate(code: Code, points: tuple[float, ...], values: list[Any]) -> list[Any]:
+    """The first four coefficients of the polynomials with these values."""
+    result = []
+    pairs = {n for n in range(1, len(points) - 1) if points[n + 1] == -points[n]}
+    sums = {n: (code.add(*values[n : n + 2]), code.subtract(*values[n : n + 2])) for n in pairs}
+    for power in range(_STEP):
+        factors, terms = [], []
+        for n, point in enumerate(points):
+            if n - 1 not in pairs:
+                factors.append(point**power)
+                terms.append(sums[n][power % 2] if n in pairs else values[n])
+        result.append(code.combine([*factors, float(power == _STEP - 1)], [*terms, values[-1]]))
+    return result
 
 
-@njit(nogil=True, forceinline=True)
-def _gather(pixels: Any, top: Any, left: Any, rows: Any, length: Any) -> None:
-    """Copy the six rows of a few tiles, 0 beyond the borders."""
-    height, width, channels = pixels.shape
-    start, stop = max(left, 0), min(left + length // channels, width)
-    for r in range(_SIZE):
-        row = rows[r * length : (r + 1) * length]
-        row[:] = np.float32(0)
-        if 0 <= top + r < height:
-            inside = pixels[top + r, start:stop]
-            row[(start - left) * channels : (stop - left) * channels] = inside.reshape(inside.size)
+def _transformer(points: tuple[float, ...]) -> Any:
+    """Make the function that writes the values at the points of the features of a tile, of eight channels."""
+    size = len(points) + 1
+
+    @intrinsic
+    def transform(
+        _: Any, pixels: Any, start: Any, row: Any, column: Any, values: Any, place: Any, distance: Any
+    ) -> Any:
+        def write(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            _, start, row, column, _, place, distance = args
+            code = Code(context, builder, signature)
+            source, target = code.data(0, args[0]), code.data(4, args[4])
+            columns = [
+                _evaluate(code, points, [code.load(source, (1, start), (r, row), (n, column)) for r in range(size)])
+                for n in range(size)
+            ]
+            for r in range(size):
+                for n, value in enumerate(_evaluate(code, points, [each[r] for each in columns])):
+                    code.store(value, target, (1, place), (r * size + n, distance))
+            return context.get_dummy_value()
+
+        return types.void(pixels, start, row, column, values, place, distance), write
+
+    return transform
+
+
+def _finisher(points: tuple[float, ...]) -> Any:
+    """Make the function that writes the results of a tile, of eight channels."""
+    size = len(points) + 1
+
+    @intrinsic
+    def finish(
+        _: Any, products: Any, start: Any, distance: Any, bias: Any, channel: Any, floor: Any, added: Any,
+        added_place: Any, added_row: Any, added_column: Any, result: Any, place: Any, row: Any, column: Any,
+    ) -> Any:  # fmt: skip
+        def write(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            _, start, distance, _, channel, floor, _, added_place, added_row, added_column, _, place, row, column = args
+            code = Code(context, builder, signature)
+            source, offset, before, target = (code.data(n, args[n]) for n in (0, 3, 6, 10))
+            rows = []
+            for r in range(size):
+                values = [code.load(source, (1, start), (r * size + n, distance)) for n in range(size)]
+                rows.append(_interpolate(code, points, values))
+            offset, least = code.load(offset, (1, channel)), code.spread(floor)
+            for n in range(_STEP):
+                for r, value in enumerate(_interpolate(code, points, [each[n] for each in rows])):
+                    kept = code.load(before, (1, added_place), (r, added_row), (n, added_column))
+                    total = code.larger(code.add(code.add(value, offset), kept), least)
+                    code.store(total, target, (1, place), (r, row), (n, column))
+            return context.get_dummy_value()
+
+        return types.void(
+            products, start, distance, bias, channel, floor, added, added_place, added_row, added_column, result, place,
+            row, column,
+        ), write  # fmt: skip
+
+    return finish
+
+
+_transform3, _transform2 = _transformer(_POINTS[3]), _transformer(_POINTS[2])
+_finish3, _finish2 = _finisher(_POINTS[3]), _finisher(_POINTS[2])
 
 
 @njit(cache=True, nogil=True)
 def _convolve(
-    first: int, last: int, pixels: Floats, weight: Floats, bias: Floats, floor: Any, kept: Any, result: Floats,
-    together: int,
+    first: int, last: int, taps: int, pixels: Floats, weight: Floats, bias: Floats, floor: Any, kept: bool,
+    result: Floats, together: int,
 ) -> None:  # fmt: skip
     # A unit is `together` tiles of a row of tiles, whatever the threads: the same bits with any number of them.
-    _, height, width, channels = pixels.shape
-    outputs = len(bias)
+    _, height, width, outputs = result.shape
+    _, in_height, in_width, channels = pixels.shape
+    size = _STEP + taps - 1
     tiles, below = -(-width // _STEP), -(-height // _STEP)
-    chunks = -(-tiles // together)
-    C, D = _UINT(channels), _UINT(outputs)
-    in_rows, places = np.empty(_SIZE * _ROW, np.float32), np.empty(_SIZE * _PLACE, np.float32)
-    products, values = np.empty(_SIZE * _PLACE, np.float32), np.empty(_SIZE * _STEP * _PLACE, np.float32)
-    border = np.empty(_SIZE * (_STEP * together + 2) * channels, np.float32)
+    chunks, blocks = -(-tiles // together), outputs // COLUMNS
+    padded = -(-together // ROWS) * ROWS
+    distance, products_distance = padded * channels + _PADDING, padded * outputs + _PADDING
+    values, products = np.zeros(size**2 * distance, np.float32), np.empty(size**2 * products_distance, np.float32)
+    all_pixels, all_results = pixels.reshape(pixels.size), result.reshape(result.size)
+    patch, piece = np.empty(size**2 * channels, np.float32), np.zeros(_STEP**2 * outputs, np.float32)
+    nothing = np.zeros(LANES, np.float32)
     for unit in range(first, last):
         image, rest = divmod(unit, below * chunks)
         y, x = rest // chunks * _STEP, rest % chunks * together * _STEP
         count = min(together, tiles - rest % chunks * together)
-        length = (_STEP * count + 2) * channels
-        if x > 0 and y > 0 and x - 1 + length // channels <= width and y - 1 + _SIZE <= height:
-            flat = pixels[image].reshape(height * width * channels)
-            place, stride = _UINT(((y - 1) * width + x - 1) * channels), _UINT(width * channels)
-            _evaluate(flat, place, stride, _UINT(length), in_rows, _UINT(0), _UINT(_ROW))
-        else:
-            _gather(pixels[image], y - 1, x - 1, border, length)
-            _evaluate(border, _UINT(0), _UINT(length), _UINT(length), in_rows, _UINT(0), _UINT(_ROW))
-        for r in range(_SIZE):
-            for n in range(_UINT(count)):
-                _evaluate(in_rows, _UINT(r * _ROW) + n * _UINT(_STEP) * C, C, C, places, n * C, _UINT(_PLACE))
-            for n in range(_SIZE):
-                given = places[n * _PLACE : n * _PLACE + count * channels].reshape(count, channels)
-                made = products[n * _PLACE : n * _PLACE + count * outputs].reshape(count, outputs)
-                np.dot(given, weight[r * _SIZE + n], made)
-            _interpolate(products, _UINT(count) * D, values, _UINT(r * _STEP * _PLACE))
-        target = result[image].reshape(height * width * outputs)
-        for r in range(min(_STEP, height - y)):
-            row = _COEFFICIENTS[r]
-            factors = row[0], row[1], row[2], row[3], row[4], row[5]
-            for n in range(min(_STEP * count, width - x)):
-                source = _UINT(n % _STEP * _PLACE + n // _STEP * outputs)
-                place = _UINT(((y + r) * width + x + n) * outputs)
-                _finish(values, source, D, factors, target, place, bias, floor, kept)
+        for t in range(count):
+            top, left = image * in_height + y - 1, x + t * _STEP - 1
+            if y > 0 and left >= 0 and y - 1 + size <= in_height and left + size <= in_width:
+                source, start, row = all_pixels, (top * in_width + left) * channels, in_width * channels
+            else:
+                source, start, row = patch, 0, size * channels
+                for r in range(size):
+                    for n in range(size):
+                        inside = 0 <= y - 1 + r < in_height and 0 <= left + n < in_width
+                        place = ((top + r) * in_width + left + n) * channels
+                        for c in range(channels):
+                            patch[r * row + n * channels + c] = all_pixels[place + c] if inside else np.float32(0)
+            for c in range(0, channels, LANES):
+                if taps == 3:
+                    _transform3(source, start + c, row, channels, values, t * channels + c, distance)
+                else:
+                    _transform2(source, start + c, row, channels, values, t * channels + c, distance)
+        for n in range(size**2):
+            for block in range(blocks):
+                for t in range(0, count, ROWS):
+                    multiply_block(
+                        values, n * distance + t * channels, channels, channels,
+                        weight, (n * blocks + block) * channels * COLUMNS,
+                        products, n * products_distance + t * outputs + block * COLUMNS, outputs,
+                    )  # fmt: skip
+        for t in range(count):
+            left = x + t * _STEP
+            inside = y + _STEP <= height and left + _STEP <= width
+            start, row = ((image * height + y) * width + left) * outputs, width * outputs
+            target, place, target_row = (all_results, start, row) if inside else (piece, 0, _STEP * outputs)
+            rows, columns = min(_STEP, height - y), min(_STEP, width - left)
+            if kept and not inside:
+                for r in range(rows):
+                    for n in range(columns * outputs):
+                        piece[r * target_row + n] = all_results[start + r * row + n]
+            added, before, added_row, column = (target, place, target_row, outputs) if kept else (nothing, 0, 0, 0)
+            for c in range(0, outputs, LANES):
+                given = (added, before + (c if kept else 0), added_row, column, target, place + c, target_row, outputs)
+                if taps == 3:
+                    _finish3(products, t * outputs + c, products_distance, bias, c, floor, *given)
+                else:
+                    _finish2(products, t * outputs + c, products_distance, bias, c, floor, *given)
+            if not inside:
+                for r in range(rows):
+                    for n in range(columns * outputs):
+                        all_results[start + r * row + n] = piece[r * target_row + n]
