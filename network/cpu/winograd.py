@@ -24,8 +24,9 @@ _STEP = 4  # results on a side of a tile
 # Points by the number of taps, beside infinity; opposite ones are neighbours and share sums. Rounding errors are 1.8
 # and 3.3 times those of the sum of products; with the usual points 0, ±1, ±2 and 0, ±1, 2 they are 3.8 and 4.8 times.
 _POINTS = {3: (0.0, 0.5**0.5, -(0.5**0.5), 2**0.5, -(2**0.5)), 2: (0.0, 0.75, -0.75, 2.0)}
-# Fewest products of two channels, those of 32 channels at 640×50, which take 0.6 of oneDNN's time.
-_FEWEST_PRODUCTS = 2**25
+# Fewest features of an image, about those of 32 channels at 1920×48, a strip of all frames. Smaller layers would gain,
+# but are a small part of a large frame, and the coarsest would carry rounding far: a tile of theirs is 64 pixels.
+_FEWEST_FEATURES = 5 * 2**19
 # Features of the tiles that are transformed together, in each of their places: with their products they fit a cache.
 _VALUES = 768
 _PADDING = 16  # numbers between places, whose distance would often be a power of two: those share lines of a cache
@@ -40,7 +41,7 @@ def can_transform(x: Tensor, weight: Tensor) -> bool:
         and not torch.is_grad_enabled()
         and len(weight) % COLUMNS == 0
         and x.shape[1] % LANES == 0
-        and len(weight) * x.numel() >= _FEWEST_PRODUCTS
+        and x[0].numel() >= _FEWEST_FEATURES
     )
 
 
