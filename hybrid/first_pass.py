@@ -106,6 +106,8 @@ class Backends(NamedTuple):
 
     torch: Callable[..., Array] | None = None  # runs OIDN's networks on a processor in less time
     bundled: Callable[..., Array] | None = None  # runs a network that ships with ravg, where OIDN is not installed
+    # the bytes that either takes on frames of this height and width
+    memory: Callable[[tuple[int, int]], int] = lambda _: 0
 
 
 NO_BACKENDS = Backends()

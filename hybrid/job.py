@@ -36,7 +36,7 @@ from hybrid.pipeline import Failed, Finished, RunSettings, View, denoise_frames,
 from hybrid.plan import NEURAL_STAGES, Rules
 from hybrid.preview import check_png
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, FINAL
-from hybrid.runtime.allocator import return_freed_memory, reuse_freed_memory
+from hybrid.runtime.allocator import reuse_freed_memory
 from hybrid.runtime.threads import limit_threads
 from hybrid.runtime.timing import Timings
 from hybrid.stream import plan_shot
@@ -229,9 +229,7 @@ def prepare_process(options: DenoiseOptions) -> None:
     """Apply the options that concern the whole process: threads, and the reuse of freed memory."""
     if options.threads is not None:
         limit_threads(options.threads)
-    if options.max_memory is not None:
-        return_freed_memory()
-    elif options.reuse_freed_memory:
+    if options.reuse_freed_memory:
         reuse_freed_memory()
 
 
@@ -492,6 +490,7 @@ class Job:
             self.first_passes[0].first_pass,
             radius=self.denoiser.radius,
             network=self.denoiser.memory,
+            first_network=self.denoiser.backends.memory,
             pools=self.denoiser.pools,
             filters_guides=self.denoiser.filter_guides is not None,
         )

@@ -34,6 +34,10 @@ VALIDATING = 38
 CLEANING = 60
 # Temporary planes while TV-L1 solves for a flow.
 REFINING = 38
+# Planes of a frame while a network in torch makes its first pass, beside that network.
+PASSING = 14
+# Bands of rows leave free memory in more pieces: `fast` takes 1429 MiB at 1920×1080 in bands of 448 rows, in float32.
+PIECES = 1.1
 _UNITS = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 
 
@@ -62,15 +66,16 @@ def plan_memory(
     *,
     radius: int = 2,
     network: Callable[[tuple[int, int]], int | None] = lambda _: None,
+    first_network: Callable[[tuple[int, int]], int] = lambda _: 0,
     pools: bool = False,
     filters_guides: bool = False,
 ) -> MemoryPlan:
     """Plan a run: whole frames in memory if they fit, else with what is kept in files, and as many rows as then fit.
 
     The result is the same for the same arguments, on every machine. `stages` are those that may run on some frame,
-    `network` maps height and width to the bytes that a network takes while it runs; with `pools` samples are pooled and
-    denoised by OIDN; with `filters_guides` the guides of frames are filtered for a network. Raises ValueError, with
-    what is needed, if not even the fewest rows fit.
+    `network` maps height and width to the bytes that a network takes while it runs, `first_network` to those of one
+    that makes a first pass; with `pools` samples are pooled and denoised by OIDN; with `filters_guides` the guides of
+    frames are filtered for a network. Raises ValueError, with what is needed, if not even the fewest rows fit.
 
     Counted in planes of one float32 a pixel: planes kept for a window, and the most that exist at once while a frame is
     prepared, finished or worked on. `tests/reliability/test_memory.py` measures the true peak.
@@ -97,13 +102,19 @@ def plan_memory(
     def needed(rows: int, in_files: bool) -> int:
         outer = min(rows + 2 * MARGIN, height)
         share = outer / height
-        # The rows that are worked on are read from files.
-        held, read = (0.0, kept * share) if in_files else (kept, 0.0)
-        working = max(plane * worked * share + (network((outer, width)) or 0), plane * aligned * share) + plane * read
+        # From files the centre and one neighbour are read at a time (`hybrid.runtime.kept.Keeper.release`), and by a
+        # network few rows of the neighbour.
+        held, read = (0.0, prepared + 3) if in_files else (kept, 0.0)
+        # The features of a strip are as large in a band.
+        working = plane * share * (worked + read * (1 if neural else 2)) + (network(shot.shape) or 0)
+        working = max(working, plane * share * (aligned + 2 * read))
         # A first pass is made while frames are prepared; pooled samples are denoised while rows are worked on.
         working += oidn if pools else min(oidn, CODE)
         cleaning = CLEANING if filters_guides else 0
-        at_once = max(plane * passing + oidn, plane * cleaning, plane * FINISHING, working)
+        # With frames in memory the final stage takes more than a first pass.
+        made = plane * PASSING + first_network(shot.shape) if in_files else 0
+        working *= PIECES if rows < height else 1
+        at_once = max(plane * passing + oidn, made, plane * cleaning, plane * FINISHING, working)
         return base + round(max(plane * held + at_once, plane * VALIDATING))
 
     budget = round(SHARE * limit)

@@ -193,6 +193,7 @@ class FrameDenoiser:
         exposure, bands = window.lit.as_rendered.exposure, self._bands()
         layers = _Layers(stream.shot.shape, stream.keeper.empty)
         outliers = 0
+        stream.keeper.trim()
         for band in bands:
             assert window is not None
             # A denoiser may be a plain function.
@@ -200,6 +201,7 @@ class FrameDenoiser:
             aligned = align(window, band, ranged=ranged, guided=guided, timings=stream.timings)
             if band is bands[-1]:
                 window = None  # frees its composed flows while the denoiser runs
+            stream.keeper.trim()
             denoised = self.denoise(aligned)
             outliers += aligned.outliers
             named: dict[tuple[str, str], NDArray[Any] | None]
@@ -213,7 +215,7 @@ class FrameDenoiser:
             shares, parts = aligned.shares, denoised.parts
             repaired, fireflies = aligned.repaired, aligned.fireflies
             del aligned, denoised, named  # before the next band is aligned
-            stream.keeper.release()
+            stream.keeper.trim()
         samples = layers.named("sides")
         color = layers.named("color")[""]
         frame, excess, passing = stream.frame(number), None, None
@@ -239,6 +241,7 @@ class FrameDenoiser:
         """The denoised frame averaged with its neighbours, and its parts changed alike."""
         result, timings = self._results[number], self.stream.timings
         colors = {n: other.denoised.color for n, other in self._results.items()}
+        self.stream.keeper.trim()
         window = self.stream.window_of_results(number, colors)
         color = np.empty_like(result.denoised.color)
         with timings.stage("stabilize"):

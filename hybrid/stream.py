@@ -135,7 +135,12 @@ class FrameStream:
         source = self.source
         if source is None or self.frame(number) is None:
             return None
-        denoised = self._cached("first pass", (number,), lambda n: source.make(self, n))
+
+        def make(number: int) -> Array | None:
+            self.keeper.trim()
+            return source.make(self, number)
+
+        denoised = self._cached("first pass", (number,), make)
         self._cache.pop(("read", (number,)), None)
         return denoised
 
@@ -233,7 +238,9 @@ class FrameStream:
             for picture, fade in zip(denoised, fades, strict=True)
         )
         noise = least_outline_noise(self.measurements(numbers)[1]) or (0.0, 0.0)
-        return Window(frames, links, denoised, plan.stages, repeated, tuple(refined), noise)
+        return Window(
+            frames, links, denoised, plan.stages, repeated, tuple(refined), noise, release=self.keeper.release
+        )
 
     def _composed(
         self, flows: dict[int, Flow | None], centre: int, before: int, number: int, *, reverse: bool = False
@@ -322,6 +329,7 @@ class FrameStream:
             frame = self.frame(number)
             given = {} if frame is None else {"albedo": frame.albedo, "normal": frame.normal}
             guides = {name: guide for name, guide in given.items() if guide is not None}
+            self.keeper.trim()
             with self.timings.stage("clean-guides"):
                 return {n: g.astype(np.float16) for n, g in run(guides).items()} if guides else None
 

@@ -94,7 +94,7 @@ def align(
     own = layers.pop("color") if given else layers["color"]
     warped, coverage = _warp_neighbours(window, layers, guides, padded, timings)
     flows = [None if link is None else link.forward.vectors[padded] for link in window.links]
-    sources = WarpSources(window.frames, flows, window.first_pass or (), window.limited, padded)
+    sources = WarpSources(window.frames, flows, window.first_pass or (), window.limited, padded, release=window.release)
     with timings.stage("confidence"):
         # Before the first pass is warped, whose place in memory the guide of all frames has until then.
         clean = clean_guide("albedo", guides, sources, warped.confidence, stages) if "albedo" in guides else None
@@ -295,6 +295,7 @@ def _warp_neighbours(
             warp_layers(there, link.forward.vectors[rows], rows, {name: layer[index] for name, layer in kept.items()})
             trust = trusts[index] = trust_geometry(layers, there, link, rows, noise)
             _set_trust(confidence, coverage, window, index, trust, rows)
+        window.release()
     return _Warped(kept, confidence, tuple(trusts)), coverage
 
 
@@ -332,6 +333,7 @@ def _warp_first_pass(
             else:
                 warped[index] = there[rows]
             fill_uncovered(warped[index], middle[rows], coverage[index])
+        window.release()
     return warped
 
 

@@ -1,6 +1,6 @@
 """A window of frames: the frames with the flows between them, and the same aligned to the centre."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import NamedTuple
@@ -23,6 +23,10 @@ from nlm.variance import prefilter_noisy_rows, smooth_variance, variance_from_wi
 STRIP = 64
 
 
+def _nothing() -> None:
+    """Release nothing: frames lie in memory."""
+
+
 @dataclass(frozen=True)
 class Window:
     """2k + 1 frames, the flows from the centre to each, and the stages that run on them."""
@@ -38,6 +42,7 @@ class Window:
     # (H, W, 3): albedo and normal of each frame without noise; None where no network needs them
     filtered_guides: tuple[Mapping[str, Array] | None, ...] | None = None
     limited: tuple[Limited | None, ...] = ()  # what the limit of residuals takes from each frame with a first pass
+    release: Callable[[], None] = _nothing  # called when a frame has been read (`hybrid.runtime.kept.Keeper.release`)
 
     @property
     def centre(self) -> PreparedFrame:
@@ -73,6 +78,7 @@ class WarpSources:
     rows: slice  # of the centre
     # (h, W, 3): radiance of an irradiance of 1 at the centre, where the albedo has noise
     modulation: Array | None = None
+    release: Callable[[], None] = _nothing  # as `Window.release`
 
     def warp(self, name: str, centre_layer: Array, part: slice = slice(None)) -> Array:
         """Warp a layer of all frames, (T, h, W, 3), to rows of the centre, or all; its own where there is no flow."""
@@ -86,6 +92,7 @@ class WarpSources:
                 warp(getattr(frame, name), vectors, first_row=first, out=out)
             else:
                 out[...] = getattr(frame, name)[first : first + len(here)]
+            self.release()
         return window
 
     @property
@@ -112,6 +119,7 @@ class WarpSources:
             divisor, start = frame.albedo if frame.demodulated else None, (self.rows.start + top, left)
             moved, clean = (None if layer is None else layer[part] for layer in (flow, self.modulation))
             warp_residual(frame.irradiance, denoised, divisor, moved, start, out, limit, clean)
+            self.release()
         return residuals
 
     def residual_strips(self) -> Iterator[tuple[int, Array]]:

@@ -13,7 +13,7 @@ from hybrid.breakdown import Breakdown, layers_of, stage_layers
 from hybrid.denoisers import WindowDenoiser
 from hybrid.files.frame import Array
 from hybrid.first_pass import Backends
-from hybrid.neural.oidn_networks import denoise_bundled, torch_backend
+from hybrid.neural.oidn_networks import denoise_bundled, first_pass_memory, torch_backend
 from hybrid.neural.tiling import Block, image_of, tiles
 from hybrid.runtime.timing import Timings
 
@@ -77,7 +77,7 @@ class NetworkDenoiser(WindowDenoiser):
     @property
     def backends(self) -> Backends:
         """Functions for the first pass: OIDN's networks in torch, and a network that ships with ravg."""
-        return Backends(torch_backend(self.setup.device, exact=self.setup.exact), denoise_bundled)
+        return Backends(torch_backend(self.setup.device, exact=self.setup.exact), denoise_bundled, first_pass_memory)
 
     def memory(self, shape: tuple[int, int]) -> int:
         """Bytes that the network takes while it runs on frames of this height and width, beside its weights."""

@@ -23,7 +23,14 @@ from network.robust_unet import RobustUNet
 from network.unet import OidnUNet, denoise_albedo, denoise_color, denoise_normal
 
 HALO = 112  # pixels of context around a tile: nothing farther away changes more than the last bits of an image
+SCRATCH = 210  # bytes for each pixel of a tile in bfloat16; measured in float32, with the free memory between blocks
 TILE = 2048  # side of a tile, so that memory does not grow with the frame: 1920×1080 is one, 3840×2160 are four
+
+
+def first_pass_memory(shape: tuple[int, int]) -> int:
+    """Bytes that a network of quality "fast" takes while it runs on frames of this height and width."""
+    height, width = (min(side, TILE + 2 * HALO) for side in shape)
+    return SCRATCH * height * width * (1 if has_bfloat16(torch.device("cpu")) else 2)
 
 
 def torch_backend(device: str, *, exact: bool) -> Callable[..., Array] | None:

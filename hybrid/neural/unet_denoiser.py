@@ -20,7 +20,7 @@ from network.windows import UNetWindow
 from nlm.pooling import clamp_to_range
 
 # Bytes for each pixel of a tile in bfloat16, by the size of the backbone; measured.
-SCRATCH = {"small": 100, "base": 100, "large": 500}
+SCRATCH = {"small": 100, "base": 150, "large": 250}
 
 
 class UNetDenoiser(NetworkDenoiser):

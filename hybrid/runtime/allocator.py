@@ -1,14 +1,14 @@
-"""Memory allocator: whether freed memory is reused or returned to the system."""
+"""Memory allocator: when freed memory is reused, and when it is returned to the system."""
 
 import ctypes
 import sys
+from collections.abc import Callable
 
 # Parameters of glibc's malloc.h. Blocks up to KEPT, and as much at the end of the heap, stay with the process. Larger
 # blocks are allocated once a frame, as OIDN's own 400 MiB, and seldom fit into free memory: with them kept, peak memory
 # grew with every frame. Features of a strip of all frames, allocated tens of times a frame, are no larger.
 M_MMAP_THRESHOLD, M_TRIM_THRESHOLD, M_ARENA_MAX = -3, -1, -8
 KEPT = 3 * 2**26
-RETURNED = 2**22  # blocks of at least so many bytes are returned in a run with a limit: planes of a 1280×720 frame
 
 
 def reuse_freed_memory() -> None:
@@ -25,17 +25,18 @@ def reuse_freed_memory() -> None:
 
 
 def return_freed_memory() -> None:
-    """Let this process return the memory it frees to the system, if its C library is glibc.
-
-    By default glibc raises the size above which it does so to 32 MiB, as blocks are freed: free memory is then
-    fragmented, and peak memory of `denoise` at 960×540 in bands of rows is a tenth higher. This costs a fifth of the
-    CPU time.
-    """
-    _adjust(M_MMAP_THRESHOLD, RETURNED)
-    _adjust(M_ARENA_MAX, 1)
+    """Return all memory that is free now to the system, if the C library is glibc; the next block is zeroed anew."""
+    trim = _function("malloc_trim")
+    if trim is not None:
+        trim(0)
 
 
 def _adjust(parameter: int, value: int) -> None:
-    adjust = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    adjust = _function("mallopt")
     if adjust is not None:
         adjust(parameter, value)
+
+
+def _function(name: str) -> Callable[..., int] | None:
+    """A function of the C library, where it has it."""
+    return getattr(ctypes.CDLL(None), name, None) if sys.platform == "linux" else None

@@ -14,6 +14,8 @@ from typing import IO, Any, TypeVar
 
 import numpy as np
 
+from hybrid.runtime.allocator import return_freed_memory
+
 Value = TypeVar("Value")
 
 # Bytes of the smallest array that gets a file of its own: a mapping takes whole pages, and calls of the system.
@@ -57,6 +59,17 @@ class Keeper:
         if self.in_files and sys.platform != "win32":  # which does so by itself when memory is short
             for mapping in list(self._mappings):
                 mapping.madvise(mmap.MADV_DONTNEED)
+
+    def trim(self) -> None:
+        """With `in_files`, also return freed memory to the system: before each stage that takes much of it.
+
+        At the end of a stage half of the process's memory is free, in pieces that blocks of the next may not fit in.
+        `fast` at 1920×1080 takes 1.1 times the CPU time with it, and 1.5 times where glibc returns all blocks of more
+        than 4 MiB as they are freed.
+        """
+        self.release()
+        if self.in_files:
+            return_freed_memory()
 
     def _keep(self, value: Any, moved: dict[int, Any]) -> Any:
         if isinstance(value, np.ndarray):

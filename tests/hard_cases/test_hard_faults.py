@@ -461,6 +461,36 @@ def test_memory_that_is_planned_is_what_was_measured(tmp_path, monkeypatch, size
         assert plan(0.85 * peak).in_files
 
 
+PEAKS_IN_FILES = [
+    # Size, bytes of a pixel that the final stage takes, and a first pass; peak memory with whole frames in files, GiB.
+    ((1080, 1920), 200, 420, 1.45),  # denoise --preset fast, in float32
+    ((1080, 1920), 300, 420, 1.63),  # balanced
+    ((1080, 1920), 500, 420, 2.04),  # quality, with windows of seven frames
+    ((2160, 3840), 200, 420, 3.44),  # fast
+]
+
+
+@pytest.mark.parametrize(("size", "scratch", "first", "peak"), PEAKS_IN_FILES)
+def test_whole_frames_lie_in_files_before_bands_of_rows_are_worked_on(
+    tmp_path, monkeypatch, size, scratch, first, peak
+):
+    """At half the memory `fast` took four times as long as without a limit, as it worked on bands of 64 rows."""
+    shot = open_shot(Scene(frames=7).write(tmp_path))
+    monkeypatch.setattr(type(shot), "shape", size)
+
+    def plan(gibibytes):
+        limit, first_pass = round(gibibytes * 2**30), PerFrame(lambda frame: frame.color)
+        pixels = min(size[0] * size[1], size[0] * 2272)  # of a tile
+        return plan_memory(
+            limit, shot, Rules().allowed, first_pass, radius=3 if scratch == 500 else 2,
+            network=lambda _: scratch * pixels, first_network=lambda _: first * pixels,
+        )  # fmt: skip
+
+    assert plan(1.15 * peak) == (None, True)
+    with suppress(ValueError):  # less than the fewest rows take
+        assert plan(0.97 * peak).rows is not None
+
+
 def test_a_frame_of_8k_fits_6_gibibytes(tmp_path, monkeypatch):
     """The comparison of pairs alone took 8.4 GiB. The peak of such a run was 5.6 GiB."""
     shot = open_shot(Scene(frames=3).write(tmp_path))

@@ -39,6 +39,22 @@ def test_estimates_are_aligned_as_the_frames_are(tmp_path):
         np.testing.assert_allclose(estimate[sure], light[sure], rtol=1e-4)
 
 
+def test_each_frame_is_released_after_it_is_read(tmp_path):
+    """Frames in files took the memory of the whole window."""
+    clean = open_shot(SCENE.write(tmp_path / "clean", clean=True))
+    source = PerFrame(lambda frame: clean.read(frame.number).color)
+    stream = FrameStream(open_shot(SCENE.write(tmp_path / "noisy")), only(STAGES), source)
+    released = []
+    window = replace(stream.window(MIDDLE), release=lambda: released.append(1))
+    aligned = align(window)
+    assert len(released) == 4 + 4  # each neighbour, and its first pass
+    for read in (lambda: aligned.residual, lambda: aligned.albedo):
+        released.clear()
+        read()
+        assert len(released) == 5
+    assert stream.window(MIDDLE).release == stream.keeper.release
+
+
 def test_a_part_of_a_frame_is_that_part_of_the_whole(tmp_path):
     folder = Scene(height=448, width=40, frames=3).write(tmp_path)
     number = SCENE.first + 1

@@ -8,6 +8,7 @@ torch = pytest.importorskip("torch")
 
 from hybrid.files.shots import open_shot  # noqa: E402
 from hybrid.neural import open_network  # noqa: E402
+from hybrid.neural.oidn_networks import HALO, SCRATCH, TILE  # noqa: E402
 from hybrid.stream import FrameStream  # noqa: E402
 from network.checkpoint import save_model, shipped_weights  # noqa: E402
 from network.paper import TKPCN_WEIGHTS  # noqa: E402
@@ -45,6 +46,16 @@ def test_memory_is_that_of_a_tile_with_its_halo():
     assert half.memory((1080, 1920)) == 100 * (64 + 2 * half.halo) ** 2
     assert full.memory((1080, 1920)) == 2 * half.memory((1080, 1920))
     assert half.memory((10, 20)) == 100 * 10 * 20
+
+
+def test_memory_of_a_first_pass_is_that_of_a_tile_with_its_halo(monkeypatch):
+    network = open_network(shipped_weights("fast"))
+    sizes = []
+    for bfloat16 in (True, False):
+        monkeypatch.setattr("hybrid.neural.oidn_networks.has_bfloat16", lambda _, bfloat16=bfloat16: bfloat16)
+        sizes.append([network.backends.memory(shape) for shape in ((10, 20), (20, 20), (9000, 9000))])
+    assert sizes[0] == [SCRATCH * 200, SCRATCH * 400, SCRATCH * (TILE + 2 * HALO) ** 2]
+    assert sizes[1] == [2 * size for size in sizes[0]]
 
 
 def test_a_network_that_needs_a_first_pass_says_so(tmp_path):
