@@ -31,6 +31,9 @@ _STEPS = 10
 _ROUGH_PIXELS = 2**17
 
 
+_Tile = tuple[slice, slice]  # rows and columns
+
+
 class _Effort(NamedTuple):
     warps: int
     iterations: int
@@ -49,7 +52,7 @@ def refine_flow(
     guides : GuidePair, their noise weakens the data term where a gradient is no stronger than the noise
     start : (H, W, 2) float array, pixels; vectors that are not finite, or longer than the frame, start from 0
     scales : int, number of scales, each half the size of the one before; fewer where the image has not 16 pixels left
-    warps, iterations : int, at each scale: linearisations, and steps of each
+    warps, iterations : int, at each scale: linearisations, and steps of each; two thirds of both at the finest one
 
     Notes
     -----
@@ -60,9 +63,9 @@ def refine_flow(
     rendered shot with a turning object. w_g = |∇I|² / (|∇I|² + σ_g²). Detail of `start` finer than b is lost: run
     `flow.selection.select_flow` afterwards.
 
-    The finest scale, three quarters of the work, is solved on tiles of 128 x 128 pixels: those where the next coarser
-    one has a pixel that `select_flow` selects. Other tiles keep the start. If more than half of the tiles are needed,
-    or with one scale, the whole frame is solved.
+    The coarsest scale is solved as a whole, the others on tiles of 128 x 128 of their pixels: those where
+    `select_flow` selects a pixel of the next coarser solution at half size. Other tiles keep the start at the finest
+    scale, and that solution at others. Where more than half of the tiles are needed a scale is solved as a whole.
 
     References
     ----------
@@ -80,28 +83,20 @@ def refine_flow(
     usable = (np.abs(start[..., 0]) <= shape[1]) & (np.abs(start[..., 1]) <= shape[0])
     start = np.array(start, np.float32)
     start[~usable] = 0
-    guides = _blurred(guides)
-    pyramid = _build_pyramid(guides, scales)
+    pyramid = _build_pyramid(_blurred(guides), scales)
     base = _smooth_start(start, pyramid)
     effort = _Effort(warps, iterations, _REFINE_ATTACHMENT)
-    change = _solve(pyramid[1:], base, np.zeros_like(base), effort)
-    tiles = _find_tiles(pyramid[1], start, base, change) if pyramid[1:] else None
+    change, tiles = _solve(pyramid[-1], base, np.zeros_like(base), effort), None
+    for index in reversed(range(len(pyramid) - 1)):
+        if index == 0:  # which starts near its solution
+            effort = _Effort(-(-2 * warps // 3), -(-2 * iterations // 3), _REFINE_ATTACHMENT)
+        tiles = _find_tiles(pyramid, index, start, base, change)
+        change = _solve(pyramid[index], base, change, effort, tiles)
     if tiles is None:
-        return np.asarray(base + _solve(pyramid[:1], base, change, effort))
-    change = _rescale(change, *shape[::-1])
-    centre, neighbour = _with_gradients(guides.centre), _with_gradients(guides.neighbour)
+        return np.asarray(base + change)
     flow = start.copy()
     for tile in tiles:
-        rows, columns = (
-            slice(max(side.start - _RIM, 0), min(side.stop + _RIM, length))
-            for side, length in zip(tile, shape, strict=True)
-        )
-        here, noise, near, first = (
-            np.ascontiguousarray(layer[rows, columns]) for layer in (centre, guides.noise, base, change)
-        )
-        solved = near + _solve_block(neighbour, here, noise, near, first, (rows.start, columns.start), effort)
-        top, left = tile[0].start - rows.start, tile[1].start - columns.start
-        flow[tile] = solved[top : top + tile[0].stop - tile[0].start, left : left + tile[1].stop - tile[1].start]
+        flow[tile] = base[tile] + change[tile]
     return flow
 
 
@@ -122,7 +117,10 @@ def dense_flow(guides: GuidePair) -> np.ndarray:
         )
         search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         start = np.asarray(search.calc(first, second, start), np.float32)
-    return _solve(_build_pyramid(guides, 3), np.zeros_like(start), start, _Effort(3, 30, _DENSE_ATTACHMENT))
+    flow, nothing = start, np.zeros_like(start)
+    for level in reversed(_build_pyramid(guides, 3)):
+        flow = _solve(level, nothing, flow, _Effort(3, 30, _DENSE_ATTACHMENT))
+    return flow
 
 
 def rough_flow(earlier: np.ndarray, later: np.ndarray) -> np.ndarray:
@@ -165,21 +163,24 @@ def _smooth_start(start: np.ndarray, pyramid: Sequence[GuidePair]) -> np.ndarray
 
 
 def _find_tiles(
-    coarse: GuidePair, start: np.ndarray, base: np.ndarray, change: np.ndarray
-) -> list[tuple[slice, slice]] | None:
-    """Find where base + change, solved at half size, explains the guides better: rows and columns; None: everywhere."""
-    height, width = start.shape[:2]
-    size = coarse.centre.shape[1::-1]
-    better = select_flow([_rescale(start, *size), _rescale(base, *size) + change], coarse)[1] > 0
-    half, called = _TILE // 2, 0
-    tiles: list[tuple[slice, slice]] = []
-    for y in range(0, better.shape[0], half):
-        rows = slice(2 * y, min(2 * y + _TILE, height))
-        for x in range(0, better.shape[1], half):
-            if not better[y : y + half, x : x + half].any():
+    pyramid: Sequence[GuidePair], index: int, start: np.ndarray, base: np.ndarray, change: np.ndarray
+) -> list[_Tile] | None:
+    """Find the tiles of a scale where base + change explains the guides at half size better; None: everywhere."""
+    height, width = pyramid[index].centre.shape[:2]
+    half = pyramid[1]
+    size = half.centre.shape[1::-1]
+    better = select_flow([_rescale(start, *size), _rescale(base, *size) + _rescale(change, *size)], half)[1] > 0
+    side, called = _TILE * 2**index // 2, 0
+    tiles: list[_Tile] = []
+    for y in range(0, height, _TILE):
+        rows = slice(y, min(y + _TILE, height))
+        top = y // _TILE * side
+        for x in range(0, width, _TILE):
+            left = x // _TILE * side
+            if not better[top : top + side, left : left + side].any():
                 continue
             called += 1
-            columns = slice(2 * x, min(2 * x + _TILE, width))
+            columns = slice(x, min(x + _TILE, width))
             if tiles and tiles[-1][0] == rows and tiles[-1][1].stop == columns.start:  # the two are solved together
                 columns = slice(tiles.pop()[1].start, columns.stop)
             tiles.append((rows, columns))
@@ -187,14 +188,28 @@ def _find_tiles(
     return None if share > _MOST_TILES else tiles
 
 
-def _solve(pyramid: Sequence[GuidePair], base: np.ndarray, change: np.ndarray, effort: _Effort) -> np.ndarray:
-    """Solve from coarse to fine for the change from `base`; its size is then that of the finest scale."""
-    for level in reversed(pyramid):
-        size = level.centre.shape[1::-1]
-        centre, neighbour = _with_gradients(level.centre), _with_gradients(level.neighbour)
-        part = centre, level.noise, _rescale(base, *size), _rescale(change, *size)
-        change = _solve_block(neighbour, *part, (0, 0), effort)
-    return change
+def _solve(
+    level: GuidePair, base: np.ndarray, change: np.ndarray, effort: _Effort, tiles: Sequence[_Tile] | None = None
+) -> np.ndarray:
+    """Solve one scale for the change from `base`, starting at `change`; elsewhere than in the tiles this is kept."""
+    height, width = level.centre.shape[:2]
+    base, change = _rescale(base, width, height), _rescale(change, width, height)
+    centre, neighbour = _with_gradients(level.centre), _with_gradients(level.neighbour)
+    if tiles is None:
+        return _solve_block(neighbour, centre, level.noise, base, change, (0, 0), effort)
+    found = change.copy()
+    for tile in tiles:
+        rows, columns = (
+            slice(max(side.start - _RIM, 0), min(side.stop + _RIM, length))
+            for side, length in zip(tile, (height, width), strict=True)
+        )
+        here, noise, near, first = (
+            np.ascontiguousarray(layer[rows, columns]) for layer in (centre, level.noise, base, change)
+        )
+        solved = _solve_block(neighbour, here, noise, near, first, (rows.start, columns.start), effort)
+        top, left = tile[0].start - rows.start, tile[1].start - columns.start
+        found[tile] = solved[top : top + tile[0].stop - tile[0].start, left : left + tile[1].stop - tile[1].start]
+    return found
 
 
 def _build_pyramid(guides: GuidePair, scales: int) -> list[GuidePair]:
@@ -229,7 +244,7 @@ def _solve_block(
     change = np.ascontiguousarray(change.transpose(2, 0, 1))
     dual = np.zeros((4, height + 1, width + 1), np.float32)
     next_change, next_dual = np.empty_like(change), np.zeros_like(dual)
-    data = np.empty((5, channels, height, width), np.float32)
+    data = np.empty((4, channels, height, width), np.float32)
     given = neighbour, centre, noise, base
     for _ in range(effort.warps):
         run_bands(_linearize, height, *given, change, corner, np.float32(effort.attachment), data)
@@ -271,13 +286,12 @@ def _linearize(
 ) -> None:  # fmt: skip
     """Expand the difference of the guides to first order about base + change.
 
-    The guides come with their gradients, (H, W, 3 G), the neighbour's of the whole frame. `data` is (5, G, H, W): the
-    difference without a change, its slope in x and in y, one over the square of the slope, and the bound of a step, in
-    slopes.
+    The guides come with their gradients, (H, W, 3 G), the neighbour's of the whole frame. `data` is (4, G, H, W): the
+    difference without a change, its slope in x and in y, all over the length of the slope, and the bound of a step.
     """
     _, width, channels = noise.shape
     frame_height, frame_width = neighbour.shape[:2]
-    half, one = np.float32(0.5), np.float32(1)
+    half = np.float32(0.5)
     for y in range(first, last):
         for x in range(width):
             u, v = change[0, y, x], change[1, y, x]
@@ -294,11 +308,11 @@ def _linearize(
                 square = ax * ax + ay * ay
                 # A gradient at the level of the noise says nothing about motion.
                 trust = square / (square + noise[y, x, g] * noise[y, x, g] + np.float32(1e-9))
-                data[0, g, y, x] = value - centre[y, x, 3 * g] - ax * u - ay * v
-                data[1, g, y, x], data[2, g, y, x] = ax, ay
                 # 1e-9: a slope of 3e-5 of the guide's range per pixel, below what 8 bits distinguish from flat.
-                data[3, g, y, x] = one / (square + np.float32(1e-9))
-                data[4, g, y, x] = _THETA * attachment * trust if place.inside else np.float32(0)
+                length = np.sqrt(square + np.float32(1e-9))
+                data[0, g, y, x] = (value - centre[y, x, 3 * g] - ax * u - ay * v) / length
+                data[1, g, y, x], data[2, g, y, x] = ax / length, ay / length
+                data[3, g, y, x] = _THETA * attachment * trust * length if place.inside else np.float32(0)
 
 
 def _iterate(
@@ -330,9 +344,9 @@ def _step(change: np.ndarray, dual: np.ndarray, data: np.ndarray, top: int, step
         for y in range(height):
             for g in range(data.shape[1]):
                 rho, gx, gy = data[0, g, top + y], data[1, g, top + y], data[2, g, top + y]
-                inverse_square, bound = data[3, g, top + y], data[4, g, top + y]
+                bound = data[3, g, top + y]
                 for x in range(width):
-                    residual = (rho[x] + gx[x] * u[y, x] + gy[x] * v[y, x]) * inverse_square[x]
+                    residual = rho[x] + gx[x] * u[y, x] + gy[x] * v[y, x]
                     residual = min(max(residual, -bound[x]), bound[x])
                     u[y, x] -= residual * gx[x]
                     v[y, x] -= residual * gy[x]
