@@ -9,7 +9,7 @@ from loops.parallel import Floats, Mask, run_bands
 
 # The image is cut into tiles whose planes stay in the cache. Long rows, because every pass over a row
 # costs as much again before its first pixel (64 wide: 2.5 times slower than 512).
-BAND, _TILE_WIDTH = 32, 512
+BAND, _TILE_WIDTH = 32, 256
 # Columns beside those that are asked for, which are filtered too: the variance has been smoothed over as many.
 _PAD = 8
 # A relative difference of 1e-3 counts as noise: half floats are no finer (2^-11), and the colour distance stays finite
@@ -132,14 +132,21 @@ def joint_nlm(
     return out
 
 
+# Rows are read from flat planes at an offset: a view of a row takes as long as ten of its pixels. Offsets are unsigned:
+# with a signed index numba tests each time whether it counts from the end.
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _add_color_distance(d: Floats, pu: Floats, pa: Floats, qu: Floats, qa: Floats, cancel: np.float32) -> None:
-    for x in range(d.size):
-        diff = pu[x] - qu[x]
-        a, b = pa[x], qa[x]
+def _add_color_distance(
+    d: Floats, far: Floats, pu: Floats, pa: Floats, p: np.uintp, qu: Floats, qa: Floats, q: np.uintp,
+    cancel: np.float32, limit: np.float32,
+) -> None:  # fmt: skip
+    """Add the distances of one channel from p to q; those of values too far apart are marked in `far`."""
+    for x in range(np.uintp(d.size)):
+        diff = pu[p + x] - qu[q + x]
+        a, b = pa[p + x], qa[q + x]
         low = a if a < b else b
         v = (diff * diff - cancel * (a + low)) / (a + b)
         d[x] += v if v < np.float32(_PIXEL_CAP) else np.float32(_PIXEL_CAP)
+        far[x] = np.float32(_NEVER) if diff * diff > limit * (a + b) else far[x]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
@@ -151,17 +158,12 @@ def _max_feature_distance(d: Floats, pf: Floats, qf: Floats, scale: Floats) -> N
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _reject_far(d: Floats, pu: Floats, pa: Floats, qu: Floats, qa: Floats, limit: np.float32) -> None:
-    for x in range(d.size):
-        diff = pu[x] - qu[x]
-        d[x] = np.float32(_NEVER) if diff * diff > limit * (pa[x] + qa[x]) else d[x]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _accumulate(total: Floats, w: Floats, values: Floats, centre: Floats) -> None:
+def _accumulate(
+    total: Floats, out: np.uintp, w: Floats, values: Floats, q: np.uintp, centre: Floats, p: np.uintp
+) -> None:
     # The difference from the centre: hundreds of roundings of a sum would shift even a constant picture.
-    for x in range(w.size):
-        total[x] += w[x] * (values[x] - centre[x])
+    for x in range(np.uintp(w.size)):
+        total[out + x] += w[x] * (values[q + x] - centre[p + x])
 
 
 @njit(cache=True, nogil=True, boundscheck=False)
@@ -183,27 +185,25 @@ def _load(target: Floats, source: Floats, top: int, left: int) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _load_frame(
-    tile: _Tile, frame: Floats, variance: Floats, confidence: Floats, k: np.float32, top: int, left: int
-) -> None:
-    """Load values, their noise term and the weight of each tap, 0 outside the frame."""
+def _load_frame(tile: _Tile, variance: Floats, frame: Floats, confidence: Floats, top: int, left: int) -> None:
+    """Load values, their noise term of a `variance` (C, h, w) and the weight of each tap, 0 outside the frame."""
     channels, h, w = tile.values.shape
     height, width = confidence.shape
+    huge, share, least = np.float32(_HUGE), np.float32(_RELATIVE_VARIANCE), np.float32(_TINY)
     _load(tile.values, frame, top, left)
-    _load(tile.noise, variance, top, left)
     tile.trust[:] = 0
     for y in range(max(-top, 0), min(height - top, h)):
         for x in range(max(-left, 0), min(width - left, w)):
             tile.trust[y, x] = confidence[top + y, left + x]
     for c in range(channels):
         for y in range(h):
+            values, noise, trust, own = tile.values[c, y], tile.noise[c, y], tile.trust[y], variance[c, y]
             for x in range(w):
-                value = tile.values[c, y, x]
-                if not abs(value) < _HUGE:
-                    tile.values[c, y, x] = value = np.float32(0)
-                    tile.trust[y, x] = np.float32(0)
-                noise = k * k * tile.noise[c, y, x] + np.float32(_RELATIVE_VARIANCE) * value * value
-                tile.noise[c, y, x] = noise if noise > np.float32(_TINY) else np.float32(_TINY)
+                known = abs(values[x]) < huge
+                values[x] = values[x] if known else np.float32(0)
+                trust[x] = trust[x] if known else np.float32(0)
+                term = own[x] + share * values[x] * values[x]
+                noise[x] = term if term > least else least
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
@@ -225,41 +225,25 @@ def _load_features(f: Floats, scale: Floats, features: Floats, top: int, left: i
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _add_patch_row(
-    column: Floats, row: Floats, centre: _Tile, frame: _Tile, corner: tuple[int, int], step: tuple[int, int],
-    cancel: np.float32,
-) -> None:  # fmt: skip
-    """Replace one row of colour distances, `row`, in the running sums over the columns of patches."""
-    w = column.size
-    for x in range(w):
-        column[x] -= row[x]
-        row[x] = 0
-    py, qy = corner[0], corner[0] + step[0]
-    p, q = slice(corner[1], corner[1] + w), slice(corner[1] + step[1], corner[1] + step[1] + w)
-    for c in range(len(centre.values)):
-        taps = frame.values[c, qy, q], frame.noise[c, qy, q]
-        _add_color_distance(row, centre.values[c, py, p], centre.noise[c, py, p], *taps, cancel)
-    for x in range(w):
-        column[x] += row[x]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _weigh(weight: Floats, column: Floats, feature: Floats, trust: Floats, patch: int, norm: np.float32) -> None:
-    """Write the weights of a row of taps: patch distance from the column sums, at least the distance of features."""
+def _weigh(
+    weight: Floats, column: Floats, least: Floats, trust: Floats, q: np.uintp, patch: int, norm: np.float32
+) -> None:
+    """Write the weights of a row of taps: patch distance from the column sums, at least `least`."""
+    size = np.uintp(weight.size)
     weight[:] = 0
-    for n in range(2 * patch + 1):
-        for x in range(weight.size):
-            weight[x] += column[x + n]
-    for x in range(weight.size):
+    for n in range(np.uintp(2 * patch + 1)):
+        for x in range(size):
+            weight[x] += column[n + x]
+    for x in range(size):
         d = weight[x] * norm
-        d = d if d > feature[x] else feature[x]
+        d = d if d > least[x] else least[x]
         # (1 - d/16)^16 is e^-d to the precision needed, and vectorises
         e = np.float32(1) - d * np.float32(1 / _NEVER)
         e = e if e > np.float32(0) else np.float32(0)
         e *= e
         e *= e
         e *= e
-        weight[x] = e * e * trust[x]
+        weight[x] = e * e * trust[q + x]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
@@ -293,11 +277,14 @@ def _filter_tile(given: _Inputs, radius: int, patch: int, k: np.float32, corner:
     padded = np.empty((F, h, w), np.float32)
     frame = _Tile(np.empty((C, h, w), np.float32), np.empty((C, h, w), np.float32), padded, trust)
     total, weight = np.zeros((C, th, tw), np.float32), np.zeros((th, tw), np.float32)
-    _load_frame(centre, given.window[T // 2], given.variance, given.confidence[T // 2], k, top, left)
+    variance = np.empty((C, h, w), np.float32)
+    _load(variance, given.variance, top, left)
+    variance *= k * k
+    _load_frame(centre, variance, given.window[T // 2], given.confidence[T // 2], top, left)
     _load_features(features, scale, given.features, corner[0], corner[1])
     _load(padded, given.features, top, left)
     for t in range(T):
-        _load_frame(frame, given.window[t], given.variance, given.confidence[t], k, top, left)
+        _load_frame(frame, variance, given.window[t], given.confidence[t], top, left)
         for dy in range(-radius, radius + 1):
             for dx in range(-radius, radius + 1):
                 _add_taps(centre, frame, scale, patch, (dy, dx), k, total, weight)
@@ -315,26 +302,39 @@ def _add_taps(
 ) -> None:  # fmt: skip
     """Add the taps of one frame at the offset `step` to all pixels of a tile."""
     C, th, tw = total.shape
-    margin, size = (frame.trust.shape[0] - th) // 2, 2 * patch + 1
+    h, w = frame.trust.shape
+    margin, size = (h - th) // 2, 2 * patch + 1
     cancel, far, norm = np.float32(1 / (k * k)), np.float32(_FAR / (k * k)), np.float32(1 / (C * size**2))
     ring, column = np.zeros((size, tw + 2 * patch), np.float32), np.zeros(tw + 2 * patch, np.float32)
-    tap, distance = np.empty(tw, np.float32), np.empty(tw, np.float32)
-    p, q = slice(margin, margin + tw), slice(margin + step[1], margin + step[1] + tw)
+    beyond, tap = np.empty((size, tw + 2 * patch), np.float32), np.empty(tw, np.float32)
+    own, own_noise = centre.values.reshape(-1), centre.noise.reshape(-1)
+    other, other_noise, trust = frame.values.reshape(-1), frame.noise.reshape(-1), frame.trust.reshape(-1)
+    sums, weights = total.reshape(-1), weight.reshape(-1)
+    shift = step[0] * w + step[1]
     for y in range(-patch, th + patch):
-        corner = y + margin, margin - patch
-        _add_patch_row(column, ring[(y + patch) % size], centre, frame, corner, step, cancel)
+        # The running sums over the columns of patches, with one row of distances replaced.
+        row, distance = ring[(y + patch) % size], beyond[(y + patch) % size]
+        for x in range(np.uintp(row.size)):
+            column[x] -= row[x]
+            row[x] = distance[x] = 0
+        for c in range(C):
+            p = (c * h + y + margin) * w + margin - patch
+            q = np.uintp(p + shift)
+            _add_color_distance(row, distance, own, own_noise, np.uintp(p), other, other_noise, q, cancel, far)
+        for x in range(np.uintp(row.size)):
+            column[x] += row[x]
         oy = y - patch
         if oy < 0:
             continue
-        py, qy = oy + margin, oy + margin + step[0]
-        distance[:] = 0
+        distance = beyond[(oy + patch) % size, patch : patch + tw]
+        qy, left = oy + margin + step[0], margin + step[1]
         for f in range(len(scale)):
-            _max_feature_distance(distance, centre.features[f, oy], frame.features[f, qy, q], scale[f, oy])
+            there = frame.features[f, qy, left : left + tw]
+            _max_feature_distance(distance, centre.features[f, oy], there, scale[f, oy])
+        p, out = (oy + margin) * w + margin, oy * tw
+        _weigh(tap, column, distance, trust, np.uintp(p + shift), patch, norm)
+        for x in range(np.uintp(tw)):
+            weights[np.uintp(out) + x] += tap[x]
         for c in range(C):
-            taps = frame.values[c, qy, q], frame.noise[c, qy, q]
-            _reject_far(distance, centre.values[c, py, p], centre.noise[c, py, p], *taps, far)
-        _weigh(tap, column, distance, frame.trust[qy, q], patch, norm)
-        for x in range(tw):
-            weight[oy, x] += tap[x]
-        for c in range(C):
-            _accumulate(total[c, oy], tap, frame.values[c, qy, q], centre.values[c, py, p])
+            q = np.uintp(p + shift + c * h * w)
+            _accumulate(sums, np.uintp(out + c * th * tw), tap, other, q, own, np.uintp(p + c * h * w))

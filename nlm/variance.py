@@ -19,6 +19,8 @@ _WARPED = 0.7
 # Variance of guides without noise: deviations of a thousandth of their range. In tiles with no more the filter would
 # change 1e-4 (RMS, five shots).
 _NOISELESS = np.float32(1e-6)
+# Beyond this share of the columns a window is filtered as a whole.
+_MOST_COLUMNS = 0.75
 # Radius, pixels, of the boxes that smooth variances.
 _RADIUS = 2
 
@@ -119,7 +121,11 @@ def prefilter_noisy_rows(centre: Floats, read: Callable[[slice], Floats], confid
     spatial, filtered = variance_from_residual(centre), centre.copy()
     for rows in _around(spatial.max(axis=(1, 2)) > _NOISELESS):
         window = read(rows)
-        for columns in _around(spatial[rows].max(axis=0).max(axis=1) > _NOISELESS):
+        parts = [*_around(spatial[rows].max(axis=0).max(axis=1) > _NOISELESS)]
+        # A part of the columns is copied first.
+        if sum(part.stop - part.start for part in parts) > _MOST_COLUMNS * centre.shape[1]:
+            parts = [slice(None)]
+        for columns in parts:
             guides, trusted = check_window(window[:, :, columns], confidence[:, rows, columns], "confidence")
             temporal, trust = _temporal_variance(guides, trusted)
             variance, noisy = np.empty_like(temporal), np.empty(trust.shape, np.bool_)
