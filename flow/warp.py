@@ -81,18 +81,44 @@ def interpolate(
     return value
 
 
+@njit(nogil=True)
+def _mix(image: np.ndarray, channel: Any, corners: Four, weights: Four) -> np.float32:
+    """Weigh four values of a flat image."""
+    a, b, c, d = corners
+    value: np.float32 = (
+        weights[0] * image[a + channel] + weights[1] * image[b + channel]
+        + weights[2] * image[c + channel] + weights[3] * image[d + channel]
+    )  # fmt: skip
+    return value
+
+
 @njit(nogil=True, cache=True)
 def _bilinear(
     first: int, last: int, image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarray, inside: np.ndarray
 ) -> None:
     height, width, channels = image.shape
+    flat, result = image.reshape(-1), out.reshape(-1)
+    column, row = np.uintp(channels), np.uintp(width * channels)
     for y in range(first, last):
         for x in range(width):
             place = locate(np.float32(x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1], width, height)
             inside[y, x] = place.inside
             weights = weigh(place)
-            for c in range(channels):
-                out[y, x, c] = interpolate(image, c, place, weights)
+            above, below = np.uintp(place.y0) * row, np.uintp(place.y1) * row
+            left, right = np.uintp(place.x0) * column, np.uintp(place.x1) * column
+            corners = above + left, above + right, below + left, below + right
+            here = np.uintp(y) * row + np.uintp(x) * column
+            if channels == 3 and x + 1 < width and corners[3] + np.uintp(3) < np.uintp(len(flat)):
+                # As in `_bicubic`: four values at once.
+                red = _mix(flat, np.uintp(0), corners, weights)
+                green = _mix(flat, np.uintp(1), corners, weights)
+                blue = _mix(flat, np.uintp(2), corners, weights)
+                next_red = _mix(flat, np.uintp(3), corners, weights)
+                result[here], result[here + np.uintp(1)] = red, green
+                result[here + np.uintp(2)], result[here + np.uintp(3)] = blue, next_red
+            else:
+                for c in range(column):
+                    result[here + c] = _mix(flat, c, corners, weights)
 
 
 @njit(nogil=True, cache=True)

@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from flow.warp import locate
 from hybrid.alignment.transfer import ALBEDO_FLOOR
 from hybrid.files.frame import Array
 from loops.parallel import run_bands
@@ -85,10 +84,10 @@ _NOTHING = Limited(np.empty((0, 0, 0), np.float32), cell_axis(1, 1), cell_axis(1
 
 
 @njit(nogil=True, inline="always")
-def _limit(residual: Any, light: Any) -> Any:
-    """Factor that limits a residual to `RESIDUAL_LIMIT` times the light, in the mean over channels."""
+def _limit(residual: Any, i: Any, light: Any) -> Any:
+    """Factor that limits the residual at index i to `RESIDUAL_LIMIT` times the light, in the mean over channels."""
     limit = RESIDUAL_LIMIT * light
-    return limit / max(abs((residual[0] + residual[1] + residual[2]) / np.float32(3)), limit)
+    return limit / max(abs((residual[i] + residual[i + 1] + residual[i + 2]) / np.float32(3)), limit)
 
 
 @njit(nogil=True, inline="always")
@@ -116,7 +115,7 @@ def _sum_limited(
             for column in range(sums.shape[2]):
                 for x in columns.pixels[column * side : (column + 1) * side]:
                     light = _difference(irradiance, first_pass, albedo, y, x, residual) + exposure
-                    share = _limit(residual, light)
+                    share = _limit(residual, np.uintp(0), light)
                     for c in range(3):
                         sums[c, row, column] += share * residual[c] / light
                         sums[3 + c, row, column] += (np.float32(1) - share) * residual[c] / light
@@ -127,34 +126,73 @@ def _warp_residual(
     first: int, last: int, irradiance: Array, first_pass: Array, albedo: Array, flow: Array, modulation: Array,
     first_row: int, first_column: int, limited: Limited, out: Array,
 ) -> None:  # fmt: skip
+    """Gather the pixels of a row first, so that all else is computed for several of its values at once."""
     height, width, _ = irradiance.shape
-    half, residual = np.float32(0.5), np.empty(3, np.float32)
+    one, zero, third = np.float32(1), np.float32(0), np.float32(3)
     lost, rows, columns, exposure = limited
+    pixels, values = np.uintp(out.shape[1]), np.uintp(3 * out.shape[1])
+    sources, light = np.empty((2, pixels), np.int32), np.empty(pixels, np.float32)
+    residual, denoised, own = np.empty(values, np.float32), np.empty(values, np.float32), np.empty(values, np.float32)
     for y in range(first, last):
-        for x in range(out.shape[1]):
-            row, column = np.uintp(first_row + y), np.uintp(first_column + x)
-            if flow.size:
-                across, down = np.float32(first_column + x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1]
-                place = locate(across, down, width, height)
-                row = np.uintp(place.y1 if place.fy >= half else place.y0)
-                column = np.uintp(place.x1 if place.fx >= half else place.x0)
-            light = _difference(irradiance, first_pass, albedo, row, column, residual) + exposure
-            if lost.size:
-                share = _limit(residual, light)
-                for c in range(3):
-                    upper = _between(lost[c, rows.before[row]], columns, column)
-                    lower = _between(lost[c, rows.after[row]], columns, column)
-                    residual[c] = share * residual[c] + light * (upper + rows.share[row] * (lower - upper))
-            for c in range(3):
-                if albedo.size and modulation.size:
-                    own, clean = max(albedo[row, column, c], np.float32(0)) + _FLOOR, modulation[y, x, c]
-                    apart = (own - clean) / (_APART * (own + clean))
-                    residual[c] *= np.float32(1) + min(apart * apart, np.float32(1)) * (own / clean - np.float32(1))
-                out[y, x, c] = residual[c]
+        _find_nearest(flow, y, first_row, first_column, width, height, sources)
+        _gather(irradiance, sources, residual)
+        _gather(first_pass, sources, denoised)
+        if albedo.size:
+            _gather(albedo, sources, own)
+            for i in range(values):
+                own[i] = max(own[i], zero) + _FLOOR
+                denoised[i] /= own[i]
+        for i in range(values):
+            residual[i] -= denoised[i]
+        if lost.size:
+            for x in range(pixels):
+                red = np.uintp(3) * x
+                light[x] = max((denoised[red] + denoised[red + 1] + denoised[red + 2]) / third, zero) + exposure
+            for x in range(pixels):
+                red, row, column = np.uintp(3) * x, np.uintp(sources[0, x]), np.uintp(sources[1, x])
+                share = _limit(residual, red, light[x])
+                above, below, down = np.uintp(rows.before[row]), np.uintp(rows.after[row]), rows.share[row]
+                left, right, across = (
+                    np.uintp(columns.before[column]), np.uintp(columns.after[column]), columns.share[column]
+                )  # fmt: skip
+                for c in range(np.uintp(3)):
+                    upper = lost[c, above, left] + across * (lost[c, above, right] - lost[c, above, left])
+                    lower = lost[c, below, left] + across * (lost[c, below, right] - lost[c, below, left])
+                    residual[red + c] = share * residual[red + c] + light[x] * (upper + down * (lower - upper))
+        result = out[y].reshape(-1)
+        if albedo.size and modulation.size:
+            clean = modulation[y].reshape(-1)
+            for i in range(values):
+                apart = (own[i] - clean[i]) / (_APART * (own[i] + clean[i]))
+                result[i] = residual[i] * (one + min(apart * apart, one) * (own[i] / clean[i] - one))
+        else:
+            for i in range(values):
+                result[i] = residual[i]
 
 
-@njit(nogil=True, inline="always")
-def _between(cells: Any, columns: Any, x: Any) -> Any:
-    """Value between the centres of a row's cells."""
-    first = cells[columns.before[x]]
-    return first + columns.share[x] * (cells[columns.after[x]] - first)
+@njit(nogil=True)
+def _find_nearest(
+    flow: Array, y: int, first_row: int, first_column: int, width: int, height: int, sources: Any
+) -> None:
+    """Write the row and column (2, n) of the pixels nearest to the ends of a row of vectors, or its own pixels."""
+    half, zero = np.float32(0.5), np.float32(0)
+    right, bottom = np.float32(width - 1), np.float32(height - 1)
+    for x in range(sources.shape[1]):
+        if flow.size:
+            # As in `flow.warp.locate`.
+            px, py = np.float32(first_column + x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1]
+            px, py = min(px, right) if px > zero else zero, min(py, bottom) if py > zero else zero
+            x0, y0 = np.int32(px), np.int32(py)
+            sources[0, x] = y0 + np.int32(py - np.float32(y0) >= half)
+            sources[1, x] = x0 + np.int32(px - np.float32(x0) >= half)
+        else:
+            sources[0, x], sources[1, x] = first_row + y, first_column + x
+
+
+@njit(nogil=True)
+def _gather(image: Any, sources: Any, values: Any) -> None:
+    """Copy the three channels of pixels, whose rows and columns are `sources` (2, n)."""
+    for x in range(np.uintp(sources.shape[1])):
+        row, column, i = np.uintp(sources[0, x]), np.uintp(sources[1, x]), np.uintp(3) * x
+        for c in range(np.uintp(3)):
+            values[i + c] = image[row, column, c]
