@@ -247,25 +247,44 @@ def _fill(first: int, last: int, warped: np.ndarray, centre: np.ndarray, coverag
 def _spread(first: int, last: int, guide: np.ndarray, is_albedo: bool, out: np.ndarray) -> None:
     """Write variances in 3×3 pixels, mirrored at borders, over the square of the albedo above 1 or of the normal."""
     height, width, channels = guide.shape
-    zero, ninth = np.float32(0), np.float32(1 / 9)
+    ninth, size = np.float32(1 / 9), np.uintp(width)
+    rows = np.empty((3, channels, width + 2), np.float32)
+    spread, greatest, square = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     for y in range(first, last):
-        rows = abs(y - 1), y, min(y + 1, max(2 * height - 3 - y, 0))
+        # By planes: several pixels are computed at once.
+        _mirror(guide, min(abs(y - 1), height - 1), rows[0])
+        _mirror(guide, y, rows[1])
+        _mirror(guide, min(y + 1, max(2 * height - 3 - y, 0)), rows[2])
+        spread[:], greatest[:], square[:] = 0, 1, 0
+        for c in range(channels):
+            a, b, d = rows[0, c], rows[1, c], rows[2, c]
+            for x in range(size):
+                total = a[x] + a[x + 1] + a[x + 2] + b[x] + b[x + 1] + b[x + 2] + d[x] + d[x + 1] + d[x + 2]
+                mean, found = total * ninth, spread[x]
+                found += (a[x] - mean) ** 2
+                found += (a[x + 1] - mean) ** 2
+                found += (a[x + 2] - mean) ** 2
+                found += (b[x] - mean) ** 2
+                found += (b[x + 1] - mean) ** 2
+                found += (b[x + 2] - mean) ** 2
+                found += (d[x] - mean) ** 2
+                found += (d[x + 1] - mean) ** 2
+                spread[x] = found + (d[x + 2] - mean) ** 2
+                greatest[x] = max(greatest[x], b[x + 1])
+                square[x] += b[x + 1] * b[x + 1]
         for x in range(width):
-            columns = abs(x - 1), x, min(x + 1, max(2 * width - 3 - x, 0))
-            spread, greatest, square = zero, np.float32(1), zero
-            for c in range(channels):
-                total = zero
-                for row in rows:
-                    for column in columns:
-                        total += _bounded(guide[min(row, height - 1), min(column, width - 1), c])
-                mean = total * ninth
-                for row in rows:
-                    for column in columns:
-                        spread += (_bounded(guide[min(row, height - 1), min(column, width - 1), c]) - mean) ** 2
-                own = _bounded(guide[y, x, c])
-                greatest = max(greatest, own)
-                square += own * own
-            out[y, x] = spread * ninth / (greatest * greatest if is_albedo else max(square, _SURFACE))
+            scale = greatest[x] * greatest[x] if is_albedo else max(square[x], _SURFACE)
+            out[y, x] = spread[x] * ninth / scale
+
+
+@njit(nogil=True)
+def _mirror(guide: np.ndarray, row: int, planes: np.ndarray) -> None:
+    """Write a row (W, C), `_bounded`, into planes (C, W + 2), with a mirrored pixel at each end."""
+    width = guide.shape[1]
+    for c in range(len(planes)):
+        for x in range(width):
+            planes[c, x + 1] = _bounded(guide[row, x, c])
+        planes[c, 0], planes[c, width + 1] = planes[c, min(2, width)], planes[c, max(width - 1, 1)]
 
 
 @njit(nogil=True)

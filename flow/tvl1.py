@@ -1,6 +1,6 @@
 """TV-L1 optical flow: refinement of a given flow, and a flow from the pictures alone."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -198,18 +198,28 @@ def _solve(
     if tiles is None:
         return _solve_block(neighbour, centre, level.noise, base, change, (0, 0), effort)
     found = change.copy()
-    for tile in tiles:
-        rows, columns = (
-            slice(max(side.start - _RIM, 0), min(side.stop + _RIM, length))
-            for side, length in zip(tile, (height, width), strict=True)
-        )
-        here, noise, near, first = (
-            np.ascontiguousarray(layer[rows, columns]) for layer in (centre, level.noise, base, change)
-        )
-        solved = _solve_block(neighbour, here, noise, near, first, (rows.start, columns.start), effort)
-        top, left = tile[0].start - rows.start, tile[1].start - columns.start
-        found[tile] = solved[top : top + tile[0].stop - tile[0].start, left : left + tile[1].stop - tile[1].start]
+
+    def solve_some(first: int, last: int) -> None:
+        for tile in tiles[first:last]:
+            rows, columns = (
+                slice(max(side.start - _RIM, 0), min(side.stop + _RIM, length))
+                for side, length in zip(tile, (height, width), strict=True)
+            )
+            here, noise, near, known = (
+                np.ascontiguousarray(layer[rows, columns]) for layer in (centre, level.noise, base, change)
+            )
+            corner = rows.start, columns.start
+            solved = _solve_block(neighbour, here, noise, near, known, corner, effort, _run_whole)
+            top, left = tile[0].start - rows.start, tile[1].start - columns.start
+            found[tile] = solved[top : top + tile[0].stop - tile[0].start, left : left + tile[1].stop - tile[1].start]
+
+    run_bands(solve_some, len(tiles))
     return found
+
+
+def _run_whole(loop: Callable[..., None], count: int, *arguments: object) -> None:
+    """Run all steps of a loop on the calling thread, as one of many tiles."""
+    loop(0, count, *arguments)
 
 
 def _build_pyramid(guides: GuidePair, scales: int) -> list[GuidePair]:
@@ -237,7 +247,7 @@ def _resize(planes: np.ndarray, width: int, height: int, interpolation: int) -> 
 
 def _solve_block(
     neighbour: np.ndarray, centre: np.ndarray, noise: np.ndarray, base: np.ndarray, change: np.ndarray,
-    corner: tuple[int, int], effort: _Effort,
+    corner: tuple[int, int], effort: _Effort, run: Callable[..., None] = run_bands,
 ) -> np.ndarray:  # fmt: skip
     """Solve TV-L1 at one scale for the change from `base`, at `corner` of the neighbour, starting at `change`."""
     height, width, channels = noise.shape
@@ -247,10 +257,10 @@ def _solve_block(
     data = np.empty((4, channels, height, width), np.float32)
     given = neighbour, centre, noise, base
     for _ in range(effort.warps):
-        run_bands(_linearize, height, *given, change, corner, np.float32(effort.attachment), data)
+        run(_linearize, height, *given, change, corner, np.float32(effort.attachment), data)
         for done in range(0, effort.iterations, _STEPS):
             steps = min(_STEPS, effort.iterations - done)
-            run_bands(_iterate, height, change, dual, data, steps, next_change, next_dual)
+            run(_iterate, height, change, dual, data, steps, next_change, next_dual)
             change, next_change, dual, next_dual = next_change, change, next_dual, dual
         # Median: what total variation leaves of single wrong vectors (Wedel 2009, section 3.3).
         change = np.stack([cv2.medianBlur(component, 3) for component in change])

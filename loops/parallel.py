@@ -8,7 +8,7 @@ numba starts them when it is asked for its number of threads, so that the number
 
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from itertools import pairwise
 
@@ -51,7 +51,8 @@ def run_bands(loop: Callable[..., None], count: int, *arguments: object) -> None
     try:
         loop(*first_band, *arguments)
     finally:
-        wait(running)
+        for band in running:
+            band.exception()  # waits, in less time than `concurrent.futures.wait`
     for band in running:
         band.result()
 
