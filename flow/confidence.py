@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 from numba import njit
 
-from flow.warp import interpolate, locate, weigh, weigh_whole
+from flow.warp import empty_places, interpolate_row, locate, locate_row, weigh, weigh_whole
+from loops.decay import decay
 from loops.parallel import run_bands
 
 # Difference of albedo (norm over channels) at which the confidence falls to 1/e.
@@ -301,39 +302,49 @@ def _compare(
     """Write squared differences of albedo and of unit normals; layers of size 0 are left out."""
     albedo, other_albedo = albedos
     normal, other_normal = normals
-    zero, one = np.float32(0), np.float32(1)
+    zero, one, infinite, width = np.float32(0), np.float32(1), np.float32(np.inf), out.shape[1]
     # All layers of the neighbour have its size, or none.
     height = max(len(other_albedo), len(other_normal), 1)
+    places = empty_places(width)
+    colors, directions = np.empty((albedo.shape[2], width), np.float32), np.empty((normal.shape[2], width), np.float32)
+    difference, greatest = np.empty(width, np.float32), np.empty(width, np.float32)
+    squares, product = np.empty((2, width), np.float32), np.empty(width, np.float32)
+    square, other_square = squares[0], squares[1]
     for y in range(first, last):
-        for x in range(out.shape[1]):
-            out[y, x, 0] = out[y, x, 1] = zero
-            if not inside[y, x]:
-                continue
-            u, v = flow[y, x, 0], flow[y, x, 1]
-            place = locate(np.float32(x) + u, np.float32(first_row + y) + v, out.shape[1], height)
-            weights = weigh(place)
-            if albedo.size:
-                difference, greatest = zero, one
-                for c in range(albedo.shape[2]):
-                    a, b = albedo[y, x, c], interpolate(other_albedo, c, place, weights)
-                    difference += (a - b) ** 2
-                    greatest = max(greatest, max(a, b))
+        locate_row(flow, y, (first_row, 0), width, height, places)
+        out[y] = zero
+        if albedo.size:
+            interpolate_row(other_albedo, places, colors)
+            difference[:], greatest[:] = zero, one
+            for c in range(albedo.shape[2]):
+                other = colors[c]
+                for x in range(width):
+                    a, b = albedo[y, x, c], other[x]
+                    difference[x] += (a - b) ** 2
+                    greatest[x] = max(greatest[x], max(a, b))
+            for x in range(width):
                 # Relative where the albedo is above 1 (emitters, sky).
-                difference /= greatest * greatest
-                out[y, x, 0] = difference if difference < _LARGEST else _LARGEST  # not where a guide is not finite
-            if normal.size:
-                square, other_square, product = zero, zero, zero
-                for c in range(normal.shape[2]):
-                    a, b = normal[y, x, c], interpolate(other_normal, c, place, weights)
-                    square += a * a
-                    other_square += b * b
-                    product += a * b
-                surface, other_surface = square > _SURFACE, other_square > _SURFACE
-                if surface and other_surface:
-                    bent = np.float32(2) * (one - product / np.sqrt(max(square * other_square, np.float32(1e-4))))
-                    out[y, x, 1] = bent if bent < _LARGEST else _LARGEST
-                elif surface != other_surface or not square + other_square < np.float32(np.inf):
-                    out[y, x, 1] = _LARGEST
+                found = difference[x] / (greatest[x] * greatest[x])
+                found = found if found < _LARGEST else _LARGEST  # not where a guide is not finite
+                out[y, x, 0] = found if inside[y, x] else zero
+        if normal.size:
+            interpolate_row(other_normal, places, directions)
+            squares[:], product[:] = zero, zero
+            for c in range(normal.shape[2]):
+                other = directions[c]
+                for x in range(width):
+                    a, b = normal[y, x, c], other[x]
+                    square[x] += a * a
+                    other_square[x] += b * b
+                    product[x] += a * b
+            for x in range(width):
+                surface, other_surface = square[x] > _SURFACE, other_square[x] > _SURFACE
+                length = np.sqrt(max(square[x] * other_square[x], np.float32(1e-4)))
+                bent = np.float32(2) * (one - product[x] / length)
+                bent = bent if bent < _LARGEST else _LARGEST
+                known = (surface == other_surface) & (square[x] + other_square[x] < infinite)
+                alone = zero if known else _LARGEST
+                out[y, x, 1] = (bent if surface & other_surface else alone) if inside[y, x] else zero
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -342,31 +353,31 @@ def _agree(
     outlines: np.ndarray, share: np.ndarray, first_row: int, height: int, out: np.ndarray,
 ) -> None:  # fmt: skip
     """Multiply the agreement of motion, albedo and normal; the reverse flow is left out if it has no rows."""
-    zero, one = np.float32(0), np.float32(1)
+    zero, one, width = np.float32(0), np.float32(1), out.shape[1]
+    places, back, near = empty_places(width), np.empty((2, width), np.float32), np.empty(width, np.bool_)
+    _, _, _, fx, fy = places
+    painted, bent, paint, bend = np.empty(width, np.float32), np.empty(width, np.float32), share[0], share[1]
     for y in range(first, last):
-        for x in range(out.shape[1]):
-            out[y, x] = zero
-            if not inside[y, x]:
-                continue
-            u, v = flow[y, x, 0], flow[y, x, 1]
-            place = locate(np.float32(x) + u, np.float32(first_row + y) + v, out.shape[1], height)
-            if reverse.size:
-                weights = weigh(place)
+        locate_row(flow, y, (first_row, 0), width, height, places)
+        near[:] = True
+        if reverse.size:
+            interpolate_row(reverse, places, back)
+            for x in range(width):
                 # Sundaram's test: there and back ends near the start.
-                du, dv = interpolate(reverse, 0, place, weights) + u, interpolate(reverse, 1, place, weights) + v
+                u, v = flow[y, x, 0], flow[y, x, 1]
+                du, dv = back[0, x] + u, back[1, x] + v
                 error = np.sqrt(du * du + dv * dv)
                 # The loop is f + r, so r at the arrival is about -f within the error: |r| is |f| + error at most.
                 length = np.sqrt(u * u + v * v)
-                bound = np.float32(0.01) * (length**2 + (length + error) ** 2) + np.float32(0.5)
-                if not error**2 < bound:
-                    continue
-            if max(distance[y, x, 0], distance[y, x, 1]) >= _LARGEST:
-                continue
-            whole = weigh_whole(place)
-            painted = max(distance[y, x, 0] - whole * share[0] * outlines[y, x, 0], zero)
-            bent = max(distance[y, x, 1] - whole * share[1] * outlines[y, x, 1], zero)
-            weight = max(one - bent / _NORMAL_LIMIT, zero)
-            out[y, x] = weight * np.exp(-painted / np.float32(_ALBEDO_SIGMA**2))
+                near[x] = error**2 < np.float32(0.01) * (length**2 + (length + error) ** 2) + np.float32(0.5)
+        for x in range(width):
+            whole = weigh_whole(fx[x], fy[x])
+            painted[x] = max(distance[y, x, 0] - whole * paint * outlines[y, x, 0], zero)
+            bent[x] = max(distance[y, x, 1] - whole * bend * outlines[y, x, 1], zero)
+            near[x] &= max(distance[y, x, 0], distance[y, x, 1]) < _LARGEST
+        for x in range(width):
+            weight = max(one - bent[x] / _NORMAL_LIMIT, zero) * decay(painted[x] / np.float32(_ALBEDO_SIGMA**2))
+            out[y, x] = weight if near[x] & inside[y, x] else zero
 
 
 def mix_centre(

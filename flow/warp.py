@@ -46,11 +46,70 @@ def locate(px: np.float32, py: np.float32, width: int, height: int) -> Place:
     return Place(inside, x0, y0, x1, y1, fx, fy)
 
 
+class RowOfPlaces(NamedTuple):
+    """As `Place`, of all positions of a row, each of n values: several are computed at once."""
+
+    inside: np.ndarray  # bool
+    x0: np.ndarray  # int32; x1 is x0 + 1 where fx is above 0, and x0 elsewhere
+    y0: np.ndarray
+    fx: np.ndarray  # float32
+    fy: np.ndarray
+
+
 @njit(nogil=True)
-def weigh_whole(place: Place) -> np.float32:
+def empty_places(size: int) -> RowOfPlaces:
+    """Places that `locate_row` has not written yet."""
+    pixels, fractions = np.empty((2, size), np.int32), np.empty((2, size), np.float32)
+    return RowOfPlaces(np.empty(size, np.bool_), pixels[0], pixels[1], fractions[0], fractions[1])
+
+
+@njit(nogil=True)
+def locate_row(flow: np.ndarray, y: int, corner: tuple[int, int], width: int, height: int, places: RowOfPlaces) -> None:
+    """`locate` the ends of a row of vectors; those of an empty flow are 0. `corner`: where the flow begins."""
+    inside, x0, y0, fx, fy = places
+    half, zero, top, left = np.float32(0.5), np.float32(0), corner[0] + y, corner[1]
+    right, bottom = np.float32(width - 1), np.float32(height - 1)
+    for x in range(len(x0)):
+        px, py = np.float32(left + x), np.float32(top)
+        if flow.size:
+            px, py = px + flow[y, x, 0], py + flow[y, x, 1]
+        inside[x] = (px >= -half) & (px <= right + half) & (py >= -half) & (py <= bottom + half)
+        px, py = min(px, right) if px > zero else zero, min(py, bottom) if py > zero else zero
+        x0[x], y0[x] = np.int32(px), np.int32(py)
+        fx[x], fy[x] = px - np.float32(x0[x]), py - np.float32(y0[x])
+
+
+@njit(nogil=True)
+def _mix(image: np.ndarray, channel: Any, corners: Four, weights: Four) -> np.float32:
+    """Weigh four values of a flat image."""
+    a, b, c, d = corners
+    value: np.float32 = (
+        weights[0] * image[a + channel] + weights[1] * image[b + channel]
+        + weights[2] * image[c + channel] + weights[3] * image[d + channel]
+    )  # fmt: skip
+    return value
+
+
+@njit(nogil=True)
+def interpolate_row(image: np.ndarray, places: RowOfPlaces, planes: np.ndarray) -> None:
+    """Sample an image (H, W, C) bilinearly at places; each channel is written into a plane of (C, n)."""
+    one, zero = np.float32(1), np.float32(0)
+    _, x0, y0, fx, fy = places
+    flat, column, row = image.reshape(-1), np.uintp(image.shape[2]), np.uintp(image.shape[1] * image.shape[2])
+    for x in range(np.uintp(len(x0))):
+        a = np.uintp(y0[x]) * row + np.uintp(x0[x]) * column
+        right, down = column if fx[x] > zero else np.uintp(0), row if fy[x] > zero else np.uintp(0)
+        corners = a, a + right, a + down, a + down + right
+        weights = (one - fy[x]) * (one - fx[x]), (one - fy[x]) * fx[x], fy[x] * (one - fx[x]), fy[x] * fx[x]
+        for c in range(column):
+            planes[c, x] = _mix(flat, c, corners, weights)
+
+
+@njit(nogil=True)
+def weigh_whole(fx: np.float32, fy: np.float32) -> np.float32:
     """Weight of a position by its distance from a whole pixel: 1 there, 0 from an eighth of a pixel on."""
     zero, one = np.float32(0), np.float32(1)
-    return max(one - max(min(place.fx, one - place.fx), min(place.fy, one - place.fy)) / _BETWEEN, zero)
+    return max(one - max(min(fx, one - fx), min(fy, one - fy)) / _BETWEEN, zero)
 
 
 def at_whole_pixels(flow: np.ndarray) -> np.ndarray:
@@ -77,17 +136,6 @@ def interpolate(
     value: np.float32 = (
         weights[0] * image[y0, x0, channel] + weights[1] * image[y0, x1, channel]
         + weights[2] * image[y1, x0, channel] + weights[3] * image[y1, x1, channel]
-    )  # fmt: skip
-    return value
-
-
-@njit(nogil=True)
-def _mix(image: np.ndarray, channel: Any, corners: Four, weights: Four) -> np.float32:
-    """Weigh four values of a flat image."""
-    a, b, c, d = corners
-    value: np.float32 = (
-        weights[0] * image[a + channel] + weights[1] * image[b + channel]
-        + weights[2] * image[c + channel] + weights[3] * image[d + channel]
     )  # fmt: skip
     return value
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numba import njit
 
+from loops.decay import decay
 from loops.parallel import Floats, Mask, run_bands
 from nlm.average import check_colors, check_exposure, check_window
 
@@ -250,4 +251,4 @@ def _weigh(first: int, last: int, mean: Floats, around: Floats, rate: Floats, bo
     """Write exp(−rate · max(mean, around)), 0 where a pixel is not finite."""
     for y in range(first, last):
         for x in range(mean.shape[1]):
-            weight[y, x] = np.exp(-rate[y, x] * max(mean[y, x], around[y, x])) if both[y, x] else np.float32(0)
+            weight[y, x] = decay(rate[y, x] * max(mean[y, x], around[y, x])) if both[y, x] else np.float32(0)

@@ -64,7 +64,7 @@ def _add(
             if not trust[y, x] > zero:
                 continue
             place = locate(np.float32(x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1], width, height)
-            weight = trust[y, x] * weigh_whole(place)
+            weight = trust[y, x] * weigh_whole(place.fx, place.fy)
             row = np.uintp(place.y1 if place.fy >= half else place.y0)
             column = np.uintp(place.x1 if place.fx >= half else place.x0)
             total[y, x] += weight

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
+from flow.warp import empty_places, locate_row
 from hybrid.alignment.transfer import ALBEDO_FLOOR
 from hybrid.files.frame import Array
 from loops.parallel import run_bands
@@ -128,13 +129,17 @@ def _warp_residual(
 ) -> None:  # fmt: skip
     """Gather the pixels of a row first, so that all else is computed for several of its values at once."""
     height, width, _ = irradiance.shape
-    one, zero, third = np.float32(1), np.float32(0), np.float32(3)
+    half, one, zero, third = np.float32(0.5), np.float32(1), np.float32(0), np.float32(3)
     lost, rows, columns, exposure = limited
     pixels, values = np.uintp(out.shape[1]), np.uintp(3 * out.shape[1])
-    sources, light = np.empty((2, pixels), np.int32), np.empty(pixels, np.float32)
+    places, sources, light = empty_places(out.shape[1]), np.empty((2, pixels), np.int32), np.empty(pixels, np.float32)
+    _, x0, y0, fx, fy = places
     residual, denoised, own = np.empty(values, np.float32), np.empty(values, np.float32), np.empty(values, np.float32)
     for y in range(first, last):
-        _find_nearest(flow, y, first_row, first_column, width, height, sources)
+        locate_row(flow, y, (first_row, first_column), width, height, places)
+        for x in range(out.shape[1]):
+            sources[0, x] = y0[x] + np.int32(fy[x] >= half)
+            sources[1, x] = x0[x] + np.int32(fx[x] >= half)
         _gather(irradiance, sources, residual)
         _gather(first_pass, sources, denoised)
         if albedo.size:
@@ -168,25 +173,6 @@ def _warp_residual(
         else:
             for i in range(values):
                 result[i] = residual[i]
-
-
-@njit(nogil=True)
-def _find_nearest(
-    flow: Array, y: int, first_row: int, first_column: int, width: int, height: int, sources: Any
-) -> None:
-    """Write the row and column (2, n) of the pixels nearest to the ends of a row of vectors, or its own pixels."""
-    half, zero = np.float32(0.5), np.float32(0)
-    right, bottom = np.float32(width - 1), np.float32(height - 1)
-    for x in range(sources.shape[1]):
-        if flow.size:
-            # As in `flow.warp.locate`.
-            px, py = np.float32(first_column + x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1]
-            px, py = min(px, right) if px > zero else zero, min(py, bottom) if py > zero else zero
-            x0, y0 = np.int32(px), np.int32(py)
-            sources[0, x] = y0 + np.int32(py - np.float32(y0) >= half)
-            sources[1, x] = x0 + np.int32(px - np.float32(x0) >= half)
-        else:
-            sources[0, x], sources[1, x] = first_row + y, first_column + x
 
 
 @njit(nogil=True)
