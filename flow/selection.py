@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 
 from flow.guide import GuidePair
-from flow.warp import interpolate, locate, weigh
+from flow.warp import empty_places, interpolate_row, locate_row
 from loops.parallel import run_bands
 
 # Share of the incumbent's error by which another flow must be better.
@@ -101,13 +101,15 @@ def _photometric_error(
 ) -> None:  # fmt: skip
     """Measure min(5, Σ_g |I₁(x + f) − I₀(x)| · scale); clear `evidence` where the flow leaves the frame."""
     height, width, channels = centre.shape
+    places, planes, total = empty_places(width), np.empty((channels, width), np.float32), np.empty(width, np.float32)
     for y in range(first, last):
+        locate_row(flow, y, (0, 0), width, height, places)
+        interpolate_row(neighbour, places, planes)
+        total[:] = 0
+        for g in range(channels):
+            values = planes[g]
+            for x in range(width):
+                total[x] += abs(values[x] - centre[y, x, g]) * scale[y, x, g]
         for x in range(width):
-            place = locate(np.float32(x) + flow[y, x, 0], np.float32(y) + flow[y, x, 1], width, height)
-            evidence[y, x] &= place.inside
-            weights = weigh(place)
-            total = np.float32(0)
-            for g in range(channels):
-                value = interpolate(neighbour, g, place, weights)
-                total += abs(value - centre[y, x, g]) * scale[y, x, g]
-            error[y, x] = min(total, np.float32(5))
+            evidence[y, x] &= places.inside[x]
+            error[y, x] = min(total[x], np.float32(5))
