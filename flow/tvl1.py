@@ -63,9 +63,9 @@ def refine_flow(
     rendered shot with a turning object. w_g = |∇I|² / (|∇I|² + σ_g²). Detail of `start` finer than b is lost: run
     `flow.selection.select_flow` afterwards.
 
-    The coarsest scale is solved as a whole, the others on tiles of 128 x 128 of their pixels: those where
-    `select_flow` selects a pixel of the next coarser solution at half size. Other tiles keep the start at the finest
-    scale, and that solution at others. Where more than half of the tiles are needed a scale is solved as a whole.
+    The finest scale is solved on tiles of 128 x 128 pixels: those where the next coarser one has a pixel that
+    `select_flow` selects. Other tiles keep the start. If more than half of the tiles are needed, or with one scale, the
+    whole frame is solved. With the next coarser scale on such tiles too one shot loses 0.8 dB of stability.
 
     References
     ----------
@@ -86,12 +86,15 @@ def refine_flow(
     pyramid = _build_pyramid(_blurred(guides), scales)
     base = _smooth_start(start, pyramid)
     effort = _Effort(warps, iterations, _REFINE_ATTACHMENT)
-    change, tiles = _solve(pyramid[-1], base, np.zeros_like(base), effort), None
-    for index in reversed(range(len(pyramid) - 1)):
-        if index == 0:  # which starts near its solution
-            effort = _Effort(-(-2 * warps // 3), -(-2 * iterations // 3), _REFINE_ATTACHMENT)
-        tiles = _find_tiles(pyramid, index, start, base, change)
-        change = _solve(pyramid[index], base, change, effort, tiles)
+    finest, *coarser = pyramid
+    change = np.zeros_like(base)
+    for level in reversed(coarser):
+        change = _solve(level, base, change, effort)
+    tiles = None
+    if coarser:
+        tiles = _find_tiles(coarser[0], start, base, change)
+        effort = _Effort(-(-2 * warps // 3), -(-2 * iterations // 3), _REFINE_ATTACHMENT)
+    change = _solve(finest, base, change, effort, tiles)
     if tiles is None:
         return np.asarray(base + change)
     flow = start.copy()
@@ -162,25 +165,20 @@ def _smooth_start(start: np.ndarray, pyramid: Sequence[GuidePair]) -> np.ndarray
     return np.where(chosen[..., None] > 0, far, near)
 
 
-def _find_tiles(
-    pyramid: Sequence[GuidePair], index: int, start: np.ndarray, base: np.ndarray, change: np.ndarray
-) -> list[_Tile] | None:
-    """Find the tiles of a scale where base + change explains the guides at half size better; None: everywhere."""
-    height, width = pyramid[index].centre.shape[:2]
-    half = pyramid[1]
-    size = half.centre.shape[1::-1]
-    better = select_flow([_rescale(start, *size), _rescale(base, *size) + _rescale(change, *size)], half)[1] > 0
-    side, called = _TILE * 2**index // 2, 0
+def _find_tiles(coarse: GuidePair, start: np.ndarray, base: np.ndarray, change: np.ndarray) -> list[_Tile] | None:
+    """Find where base + change, solved at half size, explains the guides better; None: everywhere."""
+    height, width = start.shape[:2]
+    size = coarse.centre.shape[1::-1]
+    better = select_flow([_rescale(start, *size), _rescale(base, *size) + change], coarse)[1] > 0
+    half, called = _TILE // 2, 0
     tiles: list[_Tile] = []
-    for y in range(0, height, _TILE):
-        rows = slice(y, min(y + _TILE, height))
-        top = y // _TILE * side
-        for x in range(0, width, _TILE):
-            left = x // _TILE * side
-            if not better[top : top + side, left : left + side].any():
+    for y in range(0, better.shape[0], half):
+        rows = slice(2 * y, min(2 * y + _TILE, height))
+        for x in range(0, better.shape[1], half):
+            if not better[y : y + half, x : x + half].any():
                 continue
             called += 1
-            columns = slice(x, min(x + _TILE, width))
+            columns = slice(2 * x, min(2 * x + _TILE, width))
             if tiles and tiles[-1][0] == rows and tiles[-1][1].stop == columns.start:  # the two are solved together
                 columns = slice(tiles.pop()[1].start, columns.stop)
             tiles.append((rows, columns))
