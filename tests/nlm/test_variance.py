@@ -118,6 +118,20 @@ def test_only_rows_around_noise_are_read(rng):
     assert np.abs(result[100:110] - 0.5).mean() < 0.8 * np.abs(guides[1, 100:110] - 0.5).mean()
 
 
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_columns_are_filtered_alike_in_parts_and_in_the_whole(rng, monkeypatch, share):
+    guides = np.full((3, 40, 400, 3), 0.5, np.float32)
+    for columns in (np.s_[:64], np.s_[300:]):
+        guides[:, :, columns] += rng.normal(0, 0.1, guides[:, :, columns].shape).astype(np.float32)
+    confidence = np.ones(guides.shape[:3], np.float32)
+    found = prefilter_guide(guides, confidence)
+    monkeypatch.setattr("nlm.variance._MOST_COLUMNS", share)
+    # Tiles begin elsewhere, and their running sums round otherwise.
+    np.testing.assert_allclose(prefilter_guide(guides, confidence), found, atol=1e-4)
+    assert np.abs(found[:, :64] - guides[1, :, :64]).max() > 0.05
+    np.testing.assert_array_equal(found[:, 150:250], guides[1, :, 150:250])
+
+
 def test_shapes_are_checked():
     with pytest.raises(ValueError, match=r"^b:"):
         variance_from_halves(np.zeros((4, 4, 3), np.float32), np.zeros((4, 5, 3), np.float32))
