@@ -18,7 +18,7 @@ from hybrid.files.shots import Shot, open_shot
 from hybrid.files.sidecars import names_sequence
 from hybrid.job import import_neural as import_torch
 from hybrid.plan import OLD_NAMES, Plan
-from hybrid.runtime.compiled import watch_compiling
+from hybrid.runtime.first_run import watch_compiling
 from hybrid.validation import Finding, ValidationReport, find_cut, find_repeat, validate_layers
 
 Value = TypeVar("Value")

@@ -3,92 +3,31 @@
 numba loads this module because `hybrid.runtime.threads.CACHE_LOCATORS` names it. It would raise "cannot cache
 function" where neither the package's folder nor the user's can be written to, as on a render farm, and any error of
 unpickling a truncated file. It would use a loop that was compiled before a constant or a function from another module
-changed.
-
-As a program it compiles loops that are needed late, for the process that has started it as a helper.
+changed. Where several processes need a loop, one compiles it and the others wait.
 """
 
 import atexit
-import gc
 import hashlib
 import logging
 import os
 import shutil
 import stat
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import cache, lru_cache, wraps
-from importlib import import_module
 from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any, Self
 
 import numpy as np
-from numba.core import event
+from filelock import FileLock, Timeout
 from numba.core.caching import Cache, UserWideCacheLocator
 
 LOG = logging.getLogger("ravg")
 
-# Loops that a first run needs late → the program that compiles them in a process of its own: non-local means are a
-# fifth of the compilation time, those of the network, if torch has been imported, another.
-_PROGRAMS = {"nlm.nonlocal_means": "hybrid.runtime.compiled", "network.cpu": "network.cpu.first_run"}
-
-
-class _FirstRun(event.Listener):
-    """Logs that loops are compiled, and starts helper processes that compile those needed late."""
-
-    begun = False
-    depth = 0  # a loop is compiled while another is that calls it
-    collects = False
-
-    def __init__(self) -> None:
-        self.helpers: dict[str, subprocess.Popen[bytes]] = {}
-
-    def on_start(self, event: Any) -> None:
-        if not self.depth:
-            # The compiler makes hundreds of thousands of objects: the search for garbage took a fifth of its time.
-            self.collects = gc.isenabled()
-            gc.disable()
-        self.depth += 1
-        if self.begun:
-            return
-        self.begun = True
-        LOG.info("compiling for this processor, in the first run only: ten seconds to a minute")
-        folder = getattr(event.data["dispatcher"]._cache, "cache_path", None)  # None without a cache
-        if folder and not folder.startswith(os.devnull):
-            options: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
-            if sys.platform == "win32":  # no console window if this process has none
-                options["creationflags"] = subprocess.CREATE_NO_WINDOW
-            for loops, program in _PROGRAMS.items():
-                if loops != "network.cpu" or "torch" in sys.modules:
-                    with suppress(OSError):
-                        self.helpers[loops] = subprocess.Popen([sys.executable, "-m", program], **options)
-
-    def on_end(self, event: Any) -> None:
-        self.depth -= 1
-        if self.collects and not self.depth:
-            gc.enable()
-
-    def waited_for(self, loop: Any) -> bool:
-        """Whether a helper process compiles a loop; wait for its end."""
-        helper = next((one for loops, one in self.helpers.items() if loop.__module__.startswith(loops)), None)
-        if helper is None:
-            return False
-        with suppress(subprocess.TimeoutExpired):
-            helper.wait(60)
-        return True
-
-
-_FIRST_RUN = _FirstRun()
-
-
-@lru_cache(maxsize=1)
-def watch_compiling() -> None:
-    """Log once that loops are compiled, and use two processes; later runs find them in the cache."""
-    event.register("numba:compile", _FIRST_RUN)  # type: ignore[no-untyped-call]
+PATIENCE = 60.0  # seconds to wait for another process that compiles a loop: five times as long as the longest takes
 
 
 class Fallback(UserWideCacheLocator):
@@ -138,21 +77,49 @@ def _is_private(folder: Path) -> bool:
     return stat.S_ISDIR(status.st_mode)
 
 
+def is_compiled_elsewhere(loop: Any) -> bool:
+    """Whether another process compiles a loop now."""
+    lock = _lock_of(loop._cache)
+    with suppress(OSError, NotImplementedError):
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            return True
+        lock.release()
+    return False
+
+
+def _lock_of(kept: Any) -> FileLock:
+    """The lock of a loop's files, which the system releases if the process ends."""
+    if not hasattr(kept, "lock"):
+        kept.lock = FileLock(Path(kept.cache_path, f"{kept._impl.filename_base}.lock"))
+    lock: FileLock = kept.lock
+    return lock
+
+
 def _load(load: Any) -> Any:
-    @wraps(load)
     def load_or_forget(self: Any, *args: Any) -> Any:
         try:
-            found = load(self, *args)
-            if found is None and _FIRST_RUN.waited_for(self._py_func):
-                found = load(self, *args)
-            return found
+            return load(self, *args)
         except Exception as error:  # unpickling half a file may raise any error
             LOG.debug(f"compiled loops in {self.cache_path} cannot be read, and are compiled again: {error!r}")
             with suppress(OSError):
                 self.flush()
             return None
 
-    return load_or_forget
+    @wraps(load)
+    def load_or_lock(self: Any, *args: Any) -> Any:
+        found = load_or_forget(self, *args)
+        if found is None:
+            # A folder that cannot be written to, a time-out, or a file system without locks.
+            with suppress(OSError, NotImplementedError):
+                _lock_of(self).acquire(timeout=PATIENCE, poll_interval=0.02)
+                found = load_or_forget(self, *args)  # another process may have compiled it
+        if found is not None:
+            _lock_of(self).release()
+        return found
+
+    return load_or_lock
 
 
 def _used_by(function: FunctionType, seen: set[FunctionType]) -> Iterator[str]:
@@ -197,24 +164,12 @@ def _save(save: Any) -> Any:
             save(self, *args)
         except Exception as error:  # a full disk, say, or half an index that cannot be replaced
             LOG.debug(f"compiled loops cannot be kept in {self.cache_path}: {error!r}")
+        finally:
+            _lock_of(self).release()
 
     return save_or_leave
 
 
-if __name__ != "__main__":
-    Cache._index_key = _key(Cache._index_key)  # type: ignore[method-assign]
-    Cache.load_overload = _load(Cache.load_overload)  # type: ignore[method-assign]
-    Cache.save_overload = _save(Cache.save_overload)  # type: ignore[method-assign]
-else:
-    # By its name this module changes numba's cache; changed twice, its keys would be found by no other process.
-    import_module("hybrid.runtime.compiled")
-    gc.disable()
-    from nlm.nonlocal_means import joint_nlm
-    from nlm.samples import average_neighbours, blend_samples, restore_mean
-
-    joint_nlm(np.zeros((1, 4, 4, 1), np.float32), np.zeros((4, 4, 1), np.float32))
-    window, image = np.zeros((3, 4, 4, 3), np.float32), np.zeros((4, 4, 3), np.float32)
-    confidence = np.zeros(window.shape[:3], np.float32)
-    # Every run reaches these late; what is compiled by then is loaded.
-    mean = average_neighbours(window, [(0, window)], confidence, confidence, image, image)
-    restore_mean(blend_samples(image, image, mean, 1.0), image, 1.0)
+Cache._index_key = _key(Cache._index_key)  # type: ignore[method-assign]
+Cache.load_overload = _load(Cache.load_overload)  # type: ignore[method-assign]
+Cache.save_overload = _save(Cache.save_overload)  # type: ignore[method-assign]

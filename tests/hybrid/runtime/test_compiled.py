@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import subprocess
 import sys
@@ -11,8 +10,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
-from hybrid.runtime.compiled import _FirstRun
 
 ROOT = Path(__file__).parents[3]
 NOBODY = 65534
@@ -166,69 +163,75 @@ def test_a_loop_is_compiled_again_when_a_constant_or_function_of_another_module_
     assert results(99, 2, 5) == [("47", 0), ("47", 1)]  # that function
 
 
-COUNT = """
-import sys
-from numba.core import event
-from hybrid.cli import main
+SLOW = """
+from numba import njit
 
-with event.install_recorder("numba:compile") as compiled:
-    code = main(sys.argv[1:])
-print(*(each.data["dispatcher"].__name__ for _, each in compiled.buffer if each.is_start))
-sys.exit(code)
+@njit(cache=True)
+def twice(x):
+    total = 0
+    for a in range(x):
+        for b in range(a, x):
+            total += (a * b + x) % (b + 1) - (a * b + x) % (b + 1)
+    return 2 * x + total
 """
-
-
-def test_the_longest_loop_is_compiled_beside_the_first_run_and_found_there(shot_folder, tmp_path):
-    """Where it were compiled for other types, the first run would wait for it, and compile it again."""
-    env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    words = ["denoise", str(shot_folder), "-o", str(tmp_path / "out"), "--preset", "draft"]
-    made = [
-        subprocess.run(
-            [sys.executable, "-c", COUNT, *words], env=env, cwd=ROOT, capture_output=True, text=True, check=True
-        ).stdout.split()
-        for _ in range(2)
-    ]
-    assert "_reject_outliers" in made[0]
-    assert "_filter" not in made[0]
-    assert made[1] == []
-    assert list((tmp_path / "cache").rglob("nonlocal_means._filter-*.nbc"))
-
-
-AFTER = """
+TOGETHER = """
+import sys
 from hybrid.runtime.threads import prepare_libraries
 prepare_libraries()
-import subprocess, sys
-import numpy as np
 from numba.core import event
-from nlm.nonlocal_means import joint_nlm
+import hybrid.runtime.compiled
+sys.path.insert(0, sys.argv[1])
+import loop
 
-subprocess.run([sys.executable, "-m", "hybrid.runtime.compiled"], check=True)
+print("ready", flush=True)
+sys.stdin.readline()
 with event.install_recorder("numba:compile") as compiled:
-    joint_nlm(np.zeros((1, 4, 4, 1), np.float32), np.zeros((4, 4, 1), np.float32))
-print(len(compiled.buffer))
+    value = loop.twice(21)
+print(value, sum(each.is_start for _, each in compiled.buffer))
 """
 
 
-def test_loops_that_the_program_has_compiled_are_found(tmp_path):
-    """It changed the key of numba's cache twice, and the first run compiled all of it again."""
-    env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    words = [sys.executable, "-c", AFTER]
+def test_of_processes_that_need_a_loop_one_compiles_it(shared):
+    """A second frame of a farm, started at the same time, compiled all loops again."""
+    (shared / "loop.py").write_text(SLOW)
+    env = {**os.environ, "NUMBA_CACHE_DIR": str(shared / "kept")}
+    words = [sys.executable, "-c", TOGETHER, str(shared)]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    runs = [subprocess.Popen(words, env=env, cwd=ROOT, **pipes) for _ in range(3)]
+    for one in runs:
+        assert one.stdout.readline() == "ready\n"
+    for one in runs:
+        one.stdin.write("\n")
+        one.stdin.flush()
+    said = [one.communicate()[0].split() for one in runs]
+    assert sorted(said) == [["42", "0"], ["42", "0"], ["42", "1"]]
+
+
+LOCKED = """
+import sys
+from pathlib import Path
+from hybrid.runtime.threads import prepare_libraries
+prepare_libraries()
+import hybrid.runtime.compiled as compiled
+from filelock import FileLock
+sys.path.insert(0, sys.argv[1])
+import loop
+
+kept = loop.twice._cache
+Path(kept.cache_path).mkdir(parents=True, exist_ok=True)
+compiled.PATIENCE = 0.1
+lock = FileLock(Path(kept.cache_path, f"{kept._impl.filename_base}.lock"), timeout=0)
+with lock:
+    print(compiled.is_compiled_elsewhere(loop.twice), loop.twice(21))
+print(compiled.is_compiled_elsewhere(loop.twice), loop.twice(10.5))
+with lock:  # it was released
+    print("free")
+"""
+
+
+def test_a_loop_that_is_compiled_elsewhere_for_too_long_is_compiled_here(shared):
+    (shared / "loop.py").write_text(LOOP)
+    env = {**os.environ, "NUMBA_CACHE_DIR": str(shared / "kept")}
+    words = [sys.executable, "-c", LOCKED, str(shared)]
     done = subprocess.run(words, env=env, cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["0"]
-
-
-@pytest.mark.parametrize("collects", [True, False])
-def test_no_garbage_is_looked_for_while_a_loop_is_compiled(collects):
-    """It took a fifth of the compilation; a loop that calls others compiles these first."""
-    watch, was = _FirstRun(), gc.isenabled()
-    watch.begun = True  # no helper processes
-    try:
-        (gc.enable if collects else gc.disable)()
-        watch.on_start(None)
-        watch.on_start(None)
-        watch.on_end(None)
-        assert not gc.isenabled()
-        watch.on_end(None)
-        assert gc.isenabled() == collects
-    finally:
-        (gc.enable if was else gc.disable)()
+    assert done.stdout.split() == ["True", "42", "False", "21.0", "free"]

@@ -1,0 +1,57 @@
+"""The loops that a run of `fast` has called: ``python -m tests.signatures`` writes `hybrid.runtime.signatures.FILE`."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from hybrid.runtime.signatures import FILE
+
+ROOT = Path(__file__).parent.parent
+PACKAGES = ("flow", "nlm", "hybrid")  # `network.cpu.first_run` compiles the loops of networks
+RUN = """
+import json, sys
+from hybrid.runtime.threads import prepare_libraries
+prepare_libraries()
+from hybrid.cli import main
+from hybrid.runtime.signatures import describe_type
+from numba.core.dispatcher import Dispatcher
+
+code = main(sys.argv[2:])
+for name, module in sorted(sys.modules.items()):
+    if name.startswith(tuple(sys.argv[1].split())):
+        for attribute, loop in sorted(vars(module).items()):
+            if isinstance(loop, Dispatcher) and loop.__module__ == name:
+                for signature in loop.signatures:
+                    print(json.dumps([f"{name}.{attribute}", [describe_type(one) for one in signature]]))
+sys.exit(code)
+"""
+
+
+def called_loops(folder: Path) -> list[tuple[str, Any]]:
+    """Name and arguments of each loop called for the bundled shot, and for one in which every stage runs."""
+    script = ROOT / "benchmarks" / "bench_shot.py"
+    words = [sys.executable, str(script), "--write", str(folder), "--shots", "busy", "--frames", "3", "--scale", "1"]
+    subprocess.run(words, check=True, capture_output=True)
+    called: dict[str, list[Any]] = {}
+    for index, shot in enumerate((ROOT / "examples" / "shot" / "noisy.####.exr", folder / "busy" / "busy.####.exr")):
+        words = ["denoise", str(shot), "-o", str(folder / f"out{index}"), "--preset", "fast"]
+        words = [sys.executable, "-c", RUN, " ".join(PACKAGES), *words]
+        done = subprocess.run(words, cwd=ROOT, check=True, capture_output=True, text=True)
+        for line in done.stdout.splitlines():
+            name, arguments = json.loads(line)
+            if arguments not in called.setdefault(name, []):
+                called[name].append(arguments)
+    return [(name, arguments) for name in sorted(called) for arguments in called[name]]
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as made:
+        loops = called_loops(Path(made))
+    assert len(loops) == len(dict(loops)), "a loop is compiled for several types, expected one signature of each"
+    rows = ",\n".join(f"{json.dumps(name)}: {json.dumps(arguments)}" for name, arguments in loops)
+    FILE.write_text(f"{{\n{rows}\n}}\n", encoding="utf-8")
