@@ -44,11 +44,18 @@ class Progress:
         self.task, self.total, self.unit = task, total, unit
         self.done = 0.0
         self._start = time.monotonic()
+        # Seconds and steps at the first advance: what begins a task, as reading a window of frames, is not repeated.
+        self._first: tuple[float, float] | None = None
         self._record(task, {})
 
     def advance(self, by: float = 1, message: str = "", **facts: object) -> None:
         self.done += by
-        left = self.elapsed / self.done * (self.total - self.done) if self.done else None
+        self._first = self._first or (self.elapsed, self.done)
+        seconds, steps = self._first
+        if self.done in (steps, self.total):  # after the first step nothing is known of the next
+            left = 0.0 if self.done == self.total else None
+        else:
+            left = (self.elapsed - seconds) / (self.done - steps) * (self.total - self.done)
         self._record(message or self.task, {**facts, **({} if left is None else {"seconds_left": round(left, 1)})})
 
     @property

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,22 @@ def test_progress_is_lines_where_there_is_no_terminal(log, capsys):
     assert lines[0] == "denoise: 0 of 4 frames, 0 %"
     assert lines[2].startswith("frame 1: 2 of 4 frames, 50 %, about ")
     assert len(lines) == 5
+
+
+def test_the_time_left_is_that_of_the_steps_after_the_first(log, capsys, monkeypatch):
+    """The first frame of ten reads a whole window, and compiles: seven minutes were left of two."""
+    log()
+    now = iter([0.0, 60.0, 70.0, 80.0])
+    monkeypatch.setattr(time, "monotonic", lambda: next(now))
+    progress = Progress("denoise", 4)
+    for _ in range(3):
+        progress.advance()
+    assert capsys.readouterr().err.splitlines() == [
+        "denoise: 0 of 4 frames, 0 %",
+        "denoise: 1 of 4 frames, 25 %",
+        "denoise: 2 of 4 frames, 50 %, about 20 s left",
+        "denoise: 3 of 4 frames, 75 %, about 10 s left",
+    ]
 
 
 def test_a_bar_that_hardly_moves_fills_no_log(log, capsys):
