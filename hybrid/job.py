@@ -482,7 +482,7 @@ class Job:
     def plan_memory(self) -> MemoryPlan:
         """How the run stays within its limit, if it has one; ValueError where not even a band of rows fits."""
         if self.options.max_memory is None:
-            return MemoryPlan(None, in_files=False)
+            return MemoryPlan(None, in_files=False, background=True)
         return plan_memory(
             parse_size(self.options.max_memory) // len(self.views),
             self.views[0],
@@ -512,8 +512,7 @@ class Job:
         options, runs, done, total = self.options, self.options.passes, 0, self.total()
         prepare_process(options)
         views = [View(shot, source.first_pass) for shot, source in zip(self.views, self.first_passes, strict=True)]
-        background = options.max_memory is None
-        settings = RunSettings(*self.plan_memory(), background=background, attributes=self.header())
+        settings = RunSettings(**self.plan_memory()._asdict(), attributes=self.header())
         home = output_path(self.output, self.views[0], self.views[0].numbers[0]).parent
         with ExitStack() as stack:
             for run, margin in enumerate(self.margins(), start=1):

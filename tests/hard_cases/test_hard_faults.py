@@ -415,17 +415,21 @@ def test_the_network_in_parts_is_the_network(tall, rows):
 
 def test_memory_is_planned_or_refused(tall, tmp_path, capsys, monkeypatch):
     shot = open_shot(tall)
-    assert plan_memory(2**40, shot, STAGES, None) == (None, False)
+    assert plan_memory(2**40, shot, STAGES, None) == (None, False, True)
     assert draft(tall, tmp_path / "out", "--max-memory", "10M") == 1
     assert "expected at least" in capsys.readouterr().err
     monkeypatch.setattr(type(shot), "shape", (2160, 3840))
-    rows = []
+    rows: list[int] = []
+    background: list[bool] = []
     for size in range(2, 33):
         with suppress(ValueError):  # too little
             plan = plan_memory(size * 2**30, shot, STAGES, None)
             rows.append(plan.rows or 2160)
+            background.append(plan.background)
             assert plan.in_files or plan.rows is None  # bands of rows cost more than files
     assert rows == sorted(rows)  # more memory, more rows
+    assert background == sorted(background)  # and with enough for two more frames these are read and written meanwhile
+    assert {*background} == {False, True}
     assert len(set(rows)) > 2
     assert rows[-1] == 2160
 
@@ -456,7 +460,7 @@ def test_memory_that_is_planned_is_what_was_measured(tmp_path, monkeypatch, size
         return plan_memory(round(gibibytes * 2**30), shot, Rules().allowed, estimates, network=network)
 
     # OIDN is at its fullest before all frames are there.
-    assert plan((1.5 if holds else 1.15) * peak) == (None, False)
+    assert plan((1.5 if holds else 1.15) * peak)[:2] == (None, False)
     with suppress(ValueError):
         assert plan(0.85 * peak).in_files
 
@@ -486,7 +490,7 @@ def test_whole_frames_lie_in_files_before_bands_of_rows_are_worked_on(
             network=lambda _: scratch * pixels, first_network=lambda _: first * pixels,
         )  # fmt: skip
 
-    assert plan(1.15 * peak) == (None, True)
+    assert plan(1.15 * peak) == (None, True, False)
     with suppress(ValueError):  # less than the fewest rows take
         assert plan(0.97 * peak).rows is not None
 
@@ -527,7 +531,7 @@ def test_too_little_memory_is_refused_before_any_pixel_is_read(tmp_path, monkeyp
 
 def test_little_memory_gives_the_same_bytes(tall, tmp_path, monkeypatch):
     assert draft(tall, tmp_path / "whole") == 0
-    monkeypatch.setattr("hybrid.job.plan_memory", lambda *_, **__: MemoryPlan(64, in_files=True))
+    monkeypatch.setattr("hybrid.job.plan_memory", lambda *_, **__: MemoryPlan(64, in_files=True, background=False))
     monkeypatch.setattr("hybrid.runtime.kept.SMALLEST", 1)
     assert draft(tall, tmp_path / "parts", "--max-memory", "1G") == 0
     assert contents(tmp_path / "whole") == contents(tmp_path / "parts")
