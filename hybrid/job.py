@@ -415,6 +415,7 @@ class Job:
         Raises ValueError, OSError or ImportError if an option cannot be had here, a file is damaged or would be
         overwritten, or memory does not suffice.
         """
+        prepare_process(options)
         timings, breakdown = Timings(), None if options.breakdown is None else Breakdown()
         check_paths(shot, output, options, paths=paths)
         denoiser = open_denoiser(options, timings, breakdown)
@@ -510,7 +511,6 @@ class Job:
         written are whole, also where the generator is closed early.
         """
         options, runs, done, total = self.options, self.options.passes, 0, self.total()
-        prepare_process(options)
         views = [View(shot, source.first_pass) for shot, source in zip(self.views, self.first_passes, strict=True)]
         settings = RunSettings(**self.plan_memory()._asdict(), attributes=self.header())
         home = output_path(self.output, self.views[0], self.views[0].numbers[0]).parent
