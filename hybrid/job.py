@@ -410,7 +410,9 @@ class Job:
         paths: Paths = NO_PATHS,
         validating: AbstractContextManager[object] | None = None,
     ) -> Self:
-        """Validate everything that a job depends on; `validating` is entered while frames are read and validated.
+        """Prepare the process, and validate everything that a job depends on.
+
+        `validating` is entered while frames are read and validated.
 
         Raises ValueError, OSError or ImportError if an option cannot be had here, a file is damaged or would be
         overwritten, or memory does not suffice.

@@ -44,7 +44,7 @@ class Progress:
         self.task, self.total, self.unit = task, total, unit
         self.done = 0.0
         self._start = time.monotonic()
-        # Seconds and steps at the first advance: what begins a task, as reading a window of frames, is not repeated.
+        # Seconds and steps at the first advance: the first step also reads a whole window, which is not repeated.
         self._first: tuple[float, float] | None = None
         self._record(task, {})
 
@@ -52,9 +52,8 @@ class Progress:
         self.done += by
         self._first = self._first or (self.elapsed, self.done)
         seconds, steps = self._first
-        if self.done in (steps, self.total):  # after the first step nothing is known of the next
-            left = 0.0 if self.done == self.total else None
-        else:
+        left = 0.0 if self.done == self.total else None
+        if steps < self.done < self.total:
             left = (self.elapsed - seconds) / (self.done - steps) * (self.total - self.done)
         self._record(message or self.task, {**facts, **({} if left is None else {"seconds_left": round(left, 1)})})
 

@@ -115,8 +115,8 @@ def _load(load: Any) -> Any:
             with suppress(OSError, NotImplementedError):
                 _lock_of(self).acquire(timeout=PATIENCE, poll_interval=0.02)
                 found = load_or_forget(self, *args)  # another process may have compiled it
-        if found is not None:
-            _lock_of(self).release()
+                if found is not None:
+                    _lock_of(self).release()
         return found
 
     return load_or_lock

@@ -60,6 +60,9 @@ def test_each_listed_loop_is_there():
 
 
 def test_the_list_is_that_of_the_loops_which_a_run_calls(tmp_path):
-    """A loop of another type, or one that is called no more, would be compiled in vain."""
+    """A loop of another type, or one that is called no more, would be compiled in vain.
+
+    After a change of a loop's arguments ``python -m tests.signatures`` writes the list anew.
+    """
     pytest.importorskip("torch")
     assert called_loops(tmp_path) == [*json.loads(FILE.read_text()).items()]
