@@ -31,6 +31,9 @@ GUIDE_RADIUS = 1  # frames on each side that show whether a frame's guides hold 
 # Each frame is denoised in one of eight orientations, by its number: the errors of a network in an image and in the
 # image turned differ, and average out over a window. Noise that stands still is not averaged.
 ORIENTATIONS = 8
+# Pixels on each side of the smallest image that OIDN takes as it is: of an image of one pixel it leaves a twentieth of
+# the light, as all around it is black.
+LEAST_SIDE = 16
 
 # Quality of each mode of OIDN, and of the filters that its guides go through first.
 OIDN_MODES: dict[str, dict[str, Any]] = {
@@ -302,7 +305,8 @@ def _denoise_turned(frame: Frame, denoise: Callable[..., Array], **mode: Any) ->
     mirrored, turns = divmod(frame.orientation, 4)
 
     def turn(image: Array) -> Array:
-        return np.ascontiguousarray(np.rot90(image[:, ::-1] if mirrored else image, turns))
+        # A copy: torch refuses a negative stride, also that of a side of one pixel, which counts as contiguous.
+        return np.rot90(image[:, ::-1] if mirrored else image, turns).copy()
 
     albedo, normal = (None if layer is None else turn(layer) for layer in (frame.albedo, frame.normal))
     turned = Frame(frame.number, turn(frame.color), albedo=albedo, normal=normal)
@@ -332,9 +336,18 @@ def _checked(found: Array | None, frame: Frame, highlights: Highlights | None = 
 
 def denoise_frame_oidn(frame: Frame, denoise: Callable[..., Array] | None = None, **mode: Any) -> Array:
     """Run OIDN, or what stands for it, on a frame made finite, with its guides: (H, W, 3) linear radiance."""
-    clean = [None if layer is None else replace_nonfinite(layer)[0] for layer in (frame.albedo, frame.normal)]
-    albedo, normal = clean if clean[0] is not None else (None, None)  # OIDN takes no normal alone
-    return (denoise or denoise_oidn)(replace_nonfinite(frame.color)[0], albedo, normal, **mode)
+    color = _extended(replace_nonfinite(frame.color)[0])
+    layers = (frame.albedo, frame.normal)
+    guides = [None if layer is None else _extended(replace_nonfinite(layer)[0]) for layer in layers]
+    albedo, normal = guides if guides[0] is not None else (None, None)  # OIDN takes no normal alone
+    height, width = frame.color.shape[:2]
+    return (denoise or denoise_oidn)(color, albedo, normal, **mode)[:height, :width]
+
+
+def _extended(image: Array) -> Array:
+    """An image of at least `LEAST_SIDE` pixels a side, its last row and column repeated."""
+    beyond = [(0, max(0, LEAST_SIDE - side)) for side in image.shape[:2]]
+    return np.pad(image, [*beyond, (0, 0)], mode="edge") if min(image.shape[:2]) < LEAST_SIDE else image
 
 
 def read_denoised(sequence: Shot, number: int) -> Array:

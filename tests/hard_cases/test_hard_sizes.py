@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from flow.tvl1 import dense_flow, refine_flow
+from hybrid.arrays import denoise_arrays
 from hybrid.first_pass import PerFrame
 from hybrid.pseudo_reference import CLASSICAL_PRESETS
 from hybrid.stream import plan_shot
@@ -46,6 +47,20 @@ def test_the_network_takes_any_size(size):
     image = open_network(shipped_weights("fast"))(align(noisy(size), first_pass=PerFrame(itself))).color
     assert image.shape == (*size, 3)
     assert np.isfinite(image).all()
+
+
+@pytest.mark.neural
+@pytest.mark.parametrize("source", ["bundled", pytest.param("oidn-fast", marks=pytest.mark.oidn)])
+@pytest.mark.parametrize(
+    "size", [(1, 1), (1, 64), (64, 1), (2, 3), (7, 11)], ids=["1x1", "1x64", "64x1", "2x3", "7x11"]
+)
+def test_first_passes_of_any_size_keep_the_light(size, source):
+    """In all eight orientations, one for each frame."""
+    pytest.importorskip("torch")
+    frames = [{"color": frame.color, "albedo": frame.albedo, "normal": frame.normal} for frame in noisy(size, 9)]
+    light = np.mean([frame["color"] for frame in frames])
+    results = [result.layers["color"] for result in denoise_arrays(frames, preset="fast", first_pass=source)]
+    assert np.mean(results) == pytest.approx(light, rel=0.05)
 
 
 @pytest.mark.parametrize("size", SIZES, ids=[f"{h}x{w}" for h, w in SIZES])
