@@ -394,7 +394,7 @@ def _excess(
 
     def exceed(shown: Array) -> Excess:
         counted = frame.valid if inside is None else frame.valid & inside
-        return Excess.of(np.asarray((rendered - shown) / (shown + exposure) * counted, np.float32))
+        return Excess.of(np.asarray((rendered - shown) / (np.maximum(shown, 0) + exposure) * counted, np.float32))
 
     if neighbours is None:
         return exceed(shown), None
