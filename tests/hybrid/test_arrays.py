@@ -85,11 +85,39 @@ def test_a_network_takes_a_first_pass_and_aovs_from_memory(shot):
         ([{"color": np.ones((4, 4, 3))}], {"passes": 2, "method": "network"}, "expected none for frames in memory"),
         ([{"color": np.ones((4, 4, 3))}], {"first_pass": "x.####.exr"}, "expected one of"),
         ([{"color": np.ones((4, 4, 3))}], {"numbers": [3]}, "frame 3 is not there"),
+        ([{"color": np.ones((4, 4, 3))}], {"numbers": 0}, "numbers is 0, expected a list"),
+        ([{"color": np.ones((4, 4, 3))}], {"motion": "none"}, "expected a convention"),
+        ([{"color": np.ones((4, 4, 3)), "Albedo": np.ones((4, 4, 3))}], {}, "'Albedo' is an AOV, expected none"),
+        ([{"color": np.ones((4, 4, 3), complex)}], {}, "color has type complex128, expected real numbers"),
+        ([{"color": np.ones((0, 4, 3))}], {}, "expected at least one pixel"),
+        ([np.ones((4, 4, 3))], {}, "frame 0 is a ndarray, expected names of layers"),
+        ({"color": np.ones((4, 4, 3))}, {}, "a mapping of numbers to frames"),
+        (({"color": np.ones((4, 4, 3))} for _ in range(2)), {}, "expected a list of at least one frame"),
+        (
+            [{"color": np.ones((4, 4, 3))}],
+            {"method": "network", "aov_sum": "beauty"},
+            "AOVs of which the color is the sum",
+        ),
     ],
 )
 def test_what_cannot_be_done_is_refused_at_once(frames, options, words):
     with pytest.raises(ValueError, match=words):
         hybrid.denoise_arrays(frames, **({"method": "classical"} | options))
+
+
+@pytest.mark.neural
+def test_light_passes_add_up_to_the_color_as_those_of_files():
+    pytest.importorskip("torch")
+    rng = np.random.default_rng(1)
+    frames = []
+    for _ in range(3):
+        parts = {name: rng.gamma(4, 0.25, (24, 32, 3)).astype(np.float32) for name in ("diffuse", "specular")}
+        mask = np.ones((24, 32), np.float32)
+        frames.append({"color": parts["diffuse"] + parts["specular"], **parts, "mask": mask})
+    for result in hybrid.denoise_arrays(frames, preset="fast", first_pass="bundled"):
+        layers = result.layers
+        np.testing.assert_allclose(layers["diffuse"] + layers["specular"], layers["color"], rtol=1e-4, atol=1e-5)
+        np.testing.assert_array_equal(layers["mask"], frames[0]["mask"][..., None])  # without noise: not denoised
 
 
 def test_frames_of_another_size_are_refused():
