@@ -3,13 +3,15 @@
 import hashlib
 import json
 import logging
+import math
 import re
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, fields, replace
+from numbers import Integral, Real
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, NoneType
 from typing import Literal, NamedTuple, Self, get_args, get_origin, get_type_hints
 
 from hybrid.breakdown import Breakdown, write_breakdown
@@ -37,7 +39,7 @@ from hybrid.plan import NEURAL_STAGES, Rules
 from hybrid.preview import check_png
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, FINAL
 from hybrid.runtime.allocator import reuse_freed_memory
-from hybrid.runtime.threads import limit_threads
+from hybrid.runtime.threads import MOST_THREADS, limit_threads
 from hybrid.runtime.timing import Timings
 from hybrid.stream import plan_shot
 from hybrid.validation import ValidationReport, find_cut, validate_layers
@@ -53,7 +55,11 @@ PRESETS: dict[str, tuple[str, ...]] = {
 METHOD_OF_PRESET = {preset: method for method, presets in PRESETS.items() for preset in presets}
 FIRST_PASS_OF_METHOD = {"network": "auto", "classical": "none", "pooled": "oidn-fast"}
 CHOICES = {"precision": ("auto", "float32", "bfloat16"), "aov_sum": ("layers", "beauty")}
-LEAST = {"passes": 1, "tile": 16, "threads": 1}
+LIMITS = {"passes": (1, math.inf), "tile": (16, math.inf), "threads": (1, MOST_THREADS)}
+# Types of option values: those accepted for each, and their names in messages.
+ACCEPTED: dict[type, type | tuple[type, ...]]
+ACCEPTED = {str: (str, Path), Path: (str, Path), int: Integral, float: Real, bool: bool, NoneType: NoneType}
+TYPE_NAMES = {str: "text", Path: "a path", int: "a whole number", float: "a number", bool: "True or False"}
 OF_NETWORKS = ("weights", "threshold", "passes", "breakdown", "aov_sum", "tile")  # options that only a network has
 MEASURED = tuple(reversed(NETWORKS))  # presets that a budget chooses from, the most accurate first
 
@@ -74,7 +80,7 @@ class DenoiseOptions:
     no_stages : collection of str
         Stages that are forced off.
     reuse_freed_memory : bool
-        Let the process keep memory that it frees, which saves a sixth of the CPU time; not with `max_memory`.
+        Let the process keep memory that it frees, which saves a sixth of the CPU time.
     threads : int or None
         Of numba, OpenCV and torch in this process; None leaves them as they are.
     """
@@ -102,6 +108,7 @@ class DenoiseOptions:
     threads: int | None = None
 
     def __post_init__(self) -> None:
+        self._check_types()
         preset = "pooled" if self.preset == "gathered" else self.preset  # its name for one release
         if preset == "tkpcn":
             weights = "network/paper/weights/tkpcn.safetensors"
@@ -124,13 +131,31 @@ class DenoiseOptions:
         self._check_values()
         self._check_combinations()
 
+    def _check_types(self) -> None:
+        """Refuse values of other types, and convert collections to tuples, text to paths and paths to text."""
+        for name, hint in get_type_hints(DenoiseOptions).items():
+            value = getattr(self, name)
+            if get_origin(hint) is Collection:
+                if isinstance(value, str) or not isinstance(value, Iterable):
+                    raise ValueError(f"{name} is {value!r}, expected a list of names")
+                object.__setattr__(self, name, tuple(value))
+            elif get_origin(hint) is not Literal:  # choices are checked by value
+                kinds = get_args(hint) or (hint,)
+                accepted = any(isinstance(value, ACCEPTED[kind]) for kind in kinds)
+                if not accepted or (isinstance(value, bool) and bool not in kinds):
+                    words = " or ".join(TYPE_NAMES[kind] for kind in kinds if kind is not NoneType)
+                    raise ValueError(f"{name} is {value!r}, expected {words}")
+                if isinstance(value, (str, Path)):
+                    object.__setattr__(self, name, Path(value) if Path in kinds else str(value))
+
     def _check_values(self) -> None:
         for name, expected in CHOICES.items():
-            if (value := getattr(self, name)) not in expected:
-                raise ValueError(f"{name.replace('_', '-')} is {value!r}, expected one of {', '.join(expected)}")
-        for name, least in LEAST.items():
-            if (number := getattr(self, name)) is not None and number < least:
-                raise ValueError(f"{name} is {number}, expected at least {least}")
+            if (chosen := getattr(self, name)) not in expected:
+                raise ValueError(f"{name.replace('_', '-')} is {chosen!r}, expected one of {', '.join(expected)}")
+        for name, (least, most) in LIMITS.items():
+            if (number := getattr(self, name)) is not None and not least <= number <= most:
+                bound = f"at least {least}" if number < least else f"at most {most}"
+                raise ValueError(f"{name} is {number}, expected {bound}")
         if self.threshold is not None and not 0 <= self.threshold < 1:
             raise ValueError(f"threshold is {self.threshold}, expected 0 <= threshold < 1, in units of 1/K")
         if self.budget is not None:
@@ -148,10 +173,10 @@ class DenoiseOptions:
             )
         if self.breakdown is not None and self.max_memory is not None:
             raise ValueError("--breakdown needs whole frames, expected no --max-memory with it")
-        rules = self.rules
+        forced = Rules(frozenset(self.stages), frozenset(self.no_stages))  # refuses stages that do not exist
         if self.method == "network":
             return
-        if neural := rules.on & NEURAL_STAGES:
+        if neural := forced.on & NEURAL_STAGES:
             raise ValueError(f"--stages: {min(neural)} is a stage of the network, expected one that {self.method} has")
         for name in OF_NETWORKS:
             if getattr(self, name) != DEFAULTS[name]:
@@ -196,6 +221,8 @@ if DenoiseOptions.__doc__:  # none with python -OO
 
 def replace_options(options: DenoiseOptions | None, changes: Mapping[str, object]) -> DenoiseOptions:
     """Return options, or the defaults, with some fields replaced; ValueError for a field that does not exist."""
+    if not (options is None or isinstance(options, DenoiseOptions)):
+        raise ValueError(f"options is {options!r}, expected DenoiseOptions, or keywords such as preset='draft'")
     given = dict(changes)
     if "estimate" in given:  # the old name
         warnings.warn("estimate is now first_pass, and goes in the next release", DeprecationWarning, stacklevel=3)
@@ -533,11 +560,13 @@ class Job:
                 )
                 for frame in frames:
                     done += 1
-                    if progress is not None and progress(Step(frame, run, runs, done, total)) is False:
+                    ends = progress is not None and progress(Step(frame, run, runs, done, total)) is False
+                    if ends:
                         frames.close()  # type: ignore[attr-defined]
-                        return
                     if last:
                         yield frame
+                    if ends:
+                        return
                 if not last:
                     sources = sources_of(views, self.denoiser.radius, options.rules, settings.sources)
                     settings = replace(settings, sources=sources)
@@ -591,4 +620,8 @@ def denoise_shot(
     >>> [frame.path.name for frame in denoise_shot(shot, "out/denoised.####.exr", preset="draft")]
     ['denoised.0008.exr', 'denoised.0009.exr', 'denoised.0010.exr']
     """
+    if not isinstance(shot, Shot):
+        raise ValueError(f"shot is {shot!r}, expected a Shot from hybrid.open_shot")
+    if not isinstance(output, (str, Path)):
+        raise ValueError(f"output is {output!r}, expected a pattern such as OUT.####.exr, or a folder")
     return Job.open(shot, output, replace_options(options, changes)).run(progress)

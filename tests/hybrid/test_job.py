@@ -181,7 +181,7 @@ def test_progress_counts_the_frames_of_all_passes(shot_folder, tmp_path, passes)
 def test_a_callback_or_closing_ends_the_work_after_a_frame(tmp_path):
     shot = hybrid.open_shot(Scene(frames=9).write(tmp_path / "in"))
     ended = hybrid.denoise_shot(shot, tmp_path / "a", preset="draft", progress=lambda step: step.done < 2)
-    assert len(list(ended)) == 1  # the second is written, and not returned any more
+    assert [frame.number for frame in ended] == [1001, 1002]
     closed = hybrid.denoise_shot(shot, tmp_path / "b", preset="draft")
     next(closed)
     closed.close()
@@ -208,11 +208,39 @@ def test_a_callback_or_closing_ends_the_work_after_a_frame(tmp_path):
         ({"max_memory": "much"}, "max-memory is 'much'"),
         ({"preset": "draft", "breakdown": Path("b.png")}, "breakdown is of the network"),
         ({"colour": 1}, "option 'colour' is not there"),
+        ({"threads": 10**6}, "threads is 1000000, expected at most 1024"),
+        ({"threads": "2"}, "threads is '2', expected a whole number"),
+        ({"tile": 64.5}, "tile is 64.5, expected a whole number"),
+        ({"passes": True}, "passes is True, expected a whole number"),
+        ({"threshold": "0.5"}, "threshold is '0.5', expected a number"),
+        ({"budget": 10}, "budget is 10, expected text"),
+        ({"max_memory": 8}, "max_memory is 8, expected text"),
+        ({"resume": "no"}, "resume is 'no', expected True or False"),
+        ({"stages": "gate"}, "stages is 'gate', expected a list of names"),
+        ({"weights": 1}, "weights is 1, expected a path"),
+        ({"method": "classical", "stages": ["stabilize"]}, "stabilize is a stage of the network"),
     ],
 )
 def test_options_are_validated_before_a_file_is_opened(options, words):
     with pytest.raises(ValueError, match=words):
         replace_options(None, options)
+
+
+def test_text_stands_for_paths_and_lists_for_tuples():
+    options = DenoiseOptions(preset="fast", breakdown="b.png", keep_first_pass=Path("kept"), stages=["gate"])
+    assert (options.breakdown, options.keep_first_pass, options.stages) == (Path("b.png"), "kept", ("gate",))
+    assert hash(options) == hash(replace_options(options, {"stages": ("gate",)}))
+
+
+def test_what_is_no_shot_no_output_or_no_options_is_refused(shot_folder, tmp_path):
+    shot = hybrid.open_shot(shot_folder)
+    for arguments, words in (
+        (("shot.####.exr", tmp_path), "shot is 'shot.####.exr', expected a Shot from hybrid.open_shot"),
+        ((shot, None), "output is None, expected a pattern"),
+        ((shot, tmp_path, "draft"), "options is 'draft', expected DenoiseOptions"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            hybrid.denoise_shot(*arguments)
 
 
 def test_presets_and_methods_belong_together():
