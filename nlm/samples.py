@@ -177,7 +177,7 @@ def blend_samples(
         raise ValueError(f"noisy: expected shape {picture.shape} like the picture, got {noisy.shape}")
     picture, noisy = (np.ascontiguousarray(image, np.float32) for image in (picture, noisy))
     # Radiance per unit of relative error.
-    light = _light_around(picture, noisy, exposure) + np.float32(_DARK * exposure)
+    light = _light_around(picture, noisy, neighbours.mean, exposure) + np.float32(_DARK * exposure)
     rate, height = np.divide(1, light, out=np.zeros_like(light), where=light > 0), len(picture)
     factor, near = _relative_light(noisy, neighbours, rate)
     sums = tuple(np.zeros_like(light) for _ in range(5))
@@ -212,13 +212,15 @@ def blend_samples(
     return blended
 
 
-def _light_around(picture: Floats, noisy: Floats, exposure: float) -> Floats:
+def _light_around(picture: Floats, noisy: Floats, others: Floats, exposure: float) -> Floats:
     """Mean light of a picture (H, W) over σ = 2 pixels, and of lamps beyond 64 exposures their own.
 
-    A lamp excuses no error of the pixels beside it, of which a picture may make lamps.
+    A lamp excuses no error of the pixels beside it, of which a picture may make lamps: no lamp exceeds the samples, of
+    the frame or of others. By the frame's alone, weights are greatest where its noise is dark: a lamp lost 17 %.
     """
     level, bright = channel_mean(picture), np.float32(_GLARE * exposure)
-    level = np.where(level > bright, np.minimum(level, channel_mean(noisy)), level)
+    samples = np.maximum(channel_mean(noisy), channel_mean(others))
+    level = np.where(level > bright, np.minimum(level, samples), level)
     lamp = level > bright
     around, counted = (gaussian_mean(np.where(lamp, np.float32(0), part), 2.0) for part in (level, np.float32(1)))
     return np.where(lamp, level, ratio(around, counted))

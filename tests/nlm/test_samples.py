@@ -248,6 +248,19 @@ def test_light_of_a_lamp_in_the_pixels_beside_it_is_taken_back() -> None:
     assert beside.max() < 0.1
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_noisy_lamp_keeps_its_light(seed: int) -> None:
+    """Weighed by one over each sample, a lamp of 140 pixels with noise of a third lost 17 % of its light."""
+    truth = np.full_like(ONES, 0.5)
+    truth[40:50, 60:74] = 1000
+    frames = np.stack([noisy(truth, 0.35, 10 * seed + t) for t in range(5)])
+    confidence = np.ones(frames.shape[:3], np.float32)
+    sides = average_neighbours(frames, None, confidence, confidence, ONES, frames[2])
+    blended = blend_samples(cv2.GaussianBlur(truth, (0, 0), 0.7), frames[2], sides, 0.5)
+    lamp = truth[..., 0] > 1
+    assert blended[lamp].mean() == pytest.approx(frames[2][lamp].mean(), rel=0.05)
+
+
 def test_a_wrong_outline_is_mended_where_the_alignment_is_off_too() -> None:
     """Along an outline frames differ by more than their noise; the noise beside it is the same."""
     truth = np.where(np.arange(SHAPE[1]) < SHAPE[1] // 2, 0.2, 1.0).astype(np.float32)
