@@ -17,6 +17,7 @@ import numpy as np
 from hybrid.alignment.align import align
 from hybrid.alignment.fireflies import REACH
 from hybrid.alignment.measure import FIXED_NOISE_ABOVE
+from hybrid.alignment.transfer import BLACK, measure_gain
 from hybrid.files.frame import Array, Frame
 from hybrid.files.shots import Shot, open_matching_sequence, output_path
 from hybrid.files.sources import MADE_FROM, describe_sources, sources_in, versions, why_stale
@@ -176,7 +177,7 @@ def named_first_pass(
         if spec != "auto" and (lacking := why_no_oidn()) is not None:
             raise ImportError(f'first pass {spec}: {lacking}; expected: pip install "pyoidn"')
         device = find_device(device)
-        reason, run = "asked for", partial(denoise_oidn, device=device)
+        reason, run = "asked for", partial(_run_oidn, device=device)
         in_torch = spec == "auto" and backends.torch is not None and device == "cpu"
         if spec == "auto":
             why = "its networks run in torch" if in_torch else "OIDN is installed"
@@ -268,7 +269,7 @@ class _KeptPictures:
         made_from = describe_sources(files, frame=frame.number, layers=layers, **self._facts)
         if why_stale(path, {MADE_FROM: made_from}, whole=False) is not None:
             if path.exists() and "estimate" not in sources_in(path):
-                raise ValueError(f"{path} is there, and no estimate that was kept: expected another place for them")
+                raise ValueError(f"{path} is there, and no first pass that was kept: expected another place for them")
             path.parent.mkdir(parents=True, exist_ok=True)
             shot.write(path, frame.number, {"color": run(frame, *noisy_guides)}, attributes={MADE_FROM: made_from})
         # Also a picture just written is read back, as it may be half: every run then sees the same.
@@ -280,6 +281,11 @@ def _folder_name(picture: str) -> str:
     plain = re.sub(r"[^\w.-]|^\.", "_", picture)
     known = hashlib.sha256(picture.encode(errors="surrogateescape")).hexdigest()[:8]
     return plain if plain == picture else f"{plain}-{known}"
+
+
+def _run_oidn(color: Array, *guides: Array | None, **mode: Any) -> Array:
+    """Run OIDN with a factor of ours: its own depends on the unit of dark pictures."""
+    return denoise_oidn(color, *guides, scale=measure_gain(color, dark=BLACK), **mode)
 
 
 def _run_mode(mode: str, frame: Frame, noisy_guides: bool = True, *, denoise: Callable[..., Array]) -> Array:
@@ -315,10 +321,10 @@ def _denoise_turned(frame: Frame, denoise: Callable[..., Array], **mode: Any) ->
 
 
 def _checked(found: Array | None, frame: Frame, highlights: Highlights | None = None) -> Array | None:
-    """An estimate that fits its frame and is finite, without highlights that are not in the frame, and their halos."""
+    """A first pass that fits its frame, finite, without highlights that are not in the frame, and their halos."""
     if found is None:
         return None
-    what = f"the estimate of frame {frame.number}"
+    what = f"the first pass of frame {frame.number}"
     if found.shape != frame.color.shape:
         raise ValueError(f"{what} has shape {found.shape}, expected {frame.color.shape}")
     filled, lost = replace_nonfinite(found)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hybrid.alignment.transfer import autoexposure
+from hybrid.alignment.transfer import BLACK, measure_gain
 from hybrid.files.frame import Array
 from hybrid.neural.tiling import image_of, tensor_of, tiles
 from hybrid.oidn import Quality
@@ -118,7 +118,8 @@ def _for_inference(unet: OidnUNet) -> OidnUNet:
 
 
 def _exposure(color: Array) -> float:
-    return float(np.float32(autoexposure(np.asarray(color, np.float32))))
+    # OIDN excludes 1e-8 whatever the exposure, so that dark pictures depend on their unit.
+    return float(np.float32(measure_gain(np.asarray(color, np.float32), dark=BLACK)))
 
 
 def _run_tiled(run: Callable[..., Tensor], unet: OidnUNet, layers: list[Array]) -> Array:

@@ -207,7 +207,7 @@ def test_estimates_that_are_not_finite_are_repaired_and_others_refused(tmp_path)
     result = gated_average(FrameStream(shot, only(STAGES), first_pass=PerFrame(broken)).align(MIDDLE))
     assert np.isfinite(result).all()
     assert result.min() >= 0
-    with pytest.raises(ValueError, match=r"estimate of frame \d+ has shape \(3, 4, 3\), expected \(48, 64, 3\)"):
+    with pytest.raises(ValueError, match=r"first pass of frame \d+ has shape \(3, 4, 3\), expected \(48, 64, 3\)"):
         FrameStream(shot, only(STAGES), first_pass=PerFrame(lambda frame: np.ones((3, 4, 3), np.float32))).align(MIDDLE)
     with pytest.raises(ValueError, match=f"frame {MIDDLE} has no estimate"):
         FrameStream(shot, only(STAGES), first_pass=PerFrame(lambda frame: None)).align(MIDDLE)
@@ -311,7 +311,7 @@ def test_pictures_that_are_kept_are_made_again_where_they_would_be_others(tmp_pa
     assert run() == 1
     mine = kept / f"shot.{MIDDLE}.exr"
     mine.write_bytes((folder / mine.name).read_bytes())
-    with pytest.raises(ValueError, match="is there, and no estimate that was kept"):
+    with pytest.raises(ValueError, match="is there, and no first pass that was kept"):
         run()
     assert mine.read_bytes() == (folder / mine.name).read_bytes()
 

@@ -81,6 +81,14 @@ def test_exposure_and_gain_of_an_object_on_black_are_those_of_the_object(share, 
     assert measure_gain(64 * image) == pytest.approx(measure_gain(image) / 64, rel=1e-5)
 
 
+@pytest.mark.parametrize("window", [50.0, 200.0, 500.0])
+def test_a_room_beside_a_window_counts_in_the_gain(window):
+    """From 100 times its light on, over more than a hundredth of the picture, the networks saw the room as black."""
+    image = np.ones((96, 192, 3), np.float32)
+    image[:48, :128] = window
+    assert measure_gain(image) == pytest.approx(0.18 / window ** (1 / 3), rel=0.01)
+
+
 def test_exposure_of_a_lit_image_is_its_mean_without_the_brightest_hundredth():
     image = np.random.default_rng(6).uniform(0.1, 1, (50, 70, 3)).astype(np.float32)
     level = np.sort(image.mean(axis=-1).ravel())

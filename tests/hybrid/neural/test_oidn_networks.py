@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import importlib.util
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
 from hybrid.files.frame import Frame
 from hybrid.files.shots import open_shot
-from hybrid.first_pass import OIDN_MODES, Backends, denoise_frame_oidn, find_first_pass
+from hybrid.first_pass import OIDN_MODES, Backends, denoise_frame_oidn, find_first_pass, named_first_pass
 from hybrid.neural import oidn_networks
 from hybrid.neural.oidn_networks import denoise_bundled, denoise_unet
 from hybrid.stream import FrameStream
@@ -63,6 +64,16 @@ def test_what_comes_with_ravg_stands_for_each_quality_of_oidn(frame) -> None:
 def test_clean_guides_are_declared_so(frame) -> None:
     settings = {"quality": "high", "prefilter": None, "clean": True}
     assert psnr(denoise_frame_oidn(frame, denoise_unet, **settings), denoise_frame_oidn(frame, **settings)) > 52
+
+
+@pytest.mark.parametrize("run", [None, denoise_unet])
+def test_a_dark_picture_does_not_depend_on_its_unit(frame, run) -> None:
+    """OIDN leaves what is darker than 1e-8 out of its exposure, whatever the unit: half a picture by another factor."""
+    source = named_first_pass("auto" if run else "oidn", mode="oidn", backends=Backends(run))
+    color = frame.color * np.where(np.arange(72) < 36, 1e-4, 1)[:, None, None].astype(np.float32)
+    unit = np.float32(2.0**-14)
+    bright, dark = (source.first_pass.function(replace(frame, color=scale * color)) for scale in (1, unit))
+    np.testing.assert_allclose(dark / unit, bright, rtol=1e-3, atol=1e-6)
 
 
 def test_tiles_do_not_show(frame, monkeypatch) -> None:
