@@ -80,7 +80,7 @@ def main() -> int:
     shots, clips = options.out / "shots", options.out / "clips"
     for shot in training_shots(options.scene):
         folder = shots / f"{Path(shot.scene).stem}{shot.seed}"
-        moved = ["--camera", "random", "--movers", 2] if shot.scene.endswith(".blend") else []
+        moved = ["--camera", "random", "--moving-objects", 2] if shot.scene.endswith(".blend") else []
         levels = ["--spp", shot.samples, "--levels", f"target={shot.target},a=n,b=n/e", "--frames", "1-7"]
         drawn = ["--seed", shot.seed, "--film", shot.film, "--size", "128x80", *levels, *moved]
         ravg("simulate", shot.scene, "-o", folder, *drawn, "--python", options.blender_python)

@@ -30,7 +30,7 @@ STAGES = {
     "stabilize": "average each result with those of the neighbouring frames",
     "restore-mean": "restore the local means of the samples, fireflies included, as far as these are certain",
     "blend-samples": "blend samples into results where their noise is small against the difference",
-    "alpha": "filter the alpha channel with the network's kernels",
+    "alpha": "average the alpha channel over frames, as the network averages the color",
     "skip": "leave tiles without noise out of the network",
 }
 #: Old names of stages, accepted for one release.

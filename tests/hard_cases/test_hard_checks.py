@@ -55,12 +55,12 @@ def test_one_finite_but_absurd_value_leaves_the_frames_around_alone(tmp_path, pl
 @pytest.mark.parametrize(
     ("what", "said"),
     [
-        ("nan", f"the estimate of frame {MIDDLE}: 1536 of 1536 pixels are not finite"),
-        ("half nan", f"the estimate of frame {MIDDLE}: 768 of 1536 pixels are not finite"),
-        ("huge", f"the estimate of frame {MIDDLE}: 1536 of 1536 pixels are not finite"),
-        ("black", f"the estimate of frame {MIDDLE}: it has 0 times the light in channel R"),
-        ("exposed", f"the estimate of frame {MIDDLE}: it has 4.* times the light in channel R"),
-        ("no red", f"the estimate of frame {MIDDLE}: it has 0 times the light in channel R"),
+        ("nan", f"the first pass of frame {MIDDLE}: 1536 of 1536 pixels are not finite"),
+        ("half nan", f"the first pass of frame {MIDDLE}: 768 of 1536 pixels are not finite"),
+        ("huge", f"the first pass of frame {MIDDLE}: 1536 of 1536 pixels are not finite"),
+        ("black", f"the first pass of frame {MIDDLE}: it has 0 times the light in channel R"),
+        ("exposed", f"the first pass of frame {MIDDLE}: it has 4.* times the light in channel R"),
+        ("no red", f"the first pass of frame {MIDDLE}: it has 0 times the light in channel R"),
     ],
 )
 def test_an_estimate_that_cannot_be_right_is_named_and_nothing_is_made_of_it(tmp_path, capsys, what, said):
