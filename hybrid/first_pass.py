@@ -343,6 +343,8 @@ def _checked(found: Array | None, frame: Frame, highlights: Highlights | None = 
 def denoise_frame_oidn(frame: Frame, denoise: Callable[..., Array] | None = None, **mode: Any) -> Array:
     """Run OIDN, or what stands for it, on a frame made finite, with its guides: (H, W, 3) linear radiance."""
     color = _extended(replace_nonfinite(frame.color)[0])
+    if not color.max() > 0:
+        return np.zeros_like(frame.color)  # networks leave 1e-4 on black, whatever the light of other frames
     layers = (frame.albedo, frame.normal)
     guides = [None if layer is None else _extended(replace_nonfinite(layer)[0]) for layer in layers]
     albedo, normal = guides if guides[0] is not None else (None, None)  # OIDN takes no normal alone

@@ -56,7 +56,7 @@ def measure_flows(
     if not dense and not ("refine" in stages and (forth or back)):
         # Without vectors and without a search for them, the pair has no flow.
         return PairFlows(forth and Flow(*forth), back and Flow(*back))
-    exposure = measure_exposure(earlier.radiance)
+    exposure = measure_exposure(earlier.radiance, later.radiance)
     guides = pair_guides(*(make_guide(frame.radiance, frame.albedo, exposure=exposure) for frame in (earlier, later)))
     reverse = guides._replace(centre=guides.neighbour, neighbour=guides.centre)
     if dense:

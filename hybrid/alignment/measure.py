@@ -233,7 +233,7 @@ def _is_cut(
 
 def _search(here: Array, there: Array) -> tuple[Array, Mask]:
     """Optical flow between two pictures (H, W, 3), valid everywhere."""
-    exposure = measure_exposure(here)
+    exposure = measure_exposure(here, there)
     flow = rough_flow(tone_map(there, exposure), tone_map(here, exposure))
     return flow, np.ones(flow.shape[:2], bool)
 
@@ -372,7 +372,7 @@ def same_noise_at(grainy: Array, equal: Array, pixels: Places) -> Mask:
 
 def _changed(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | None) -> float:
     """Share of the picture whose light differs between two frames by more than its noise, along `vectors`."""
-    exposure = measure_exposure(here.light)
+    exposure = measure_exposure(here.light, there.light)
     other, inside = there.light, np.ones(here.light.shape[:2], bool)
     if vectors is not None:
         other, inside = warp(other, vectors[0])
@@ -493,7 +493,7 @@ def _changed_areas(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Ma
         (both[1], inside), (light, _) = warp(there.irradiance, vectors[0]), warp(there.light, vectors[0])
         inside &= vectors[1]
     inside &= _coverage(here, there)
-    floor = np.float32(0.05 * measure_exposure(here.light))
+    floor = np.float32(0.05 * measure_exposure(here.light, there.light))
     level = 0.5 * (channel_mean(here.light) + channel_mean(light)) + floor
     difference = np.where(inside, (channel_mean(both[1]) - channel_mean(both[0])) / level, np.float32(0))
     sums = np.stack([difference, np.square(difference), inside.astype(np.float32)], axis=-1)

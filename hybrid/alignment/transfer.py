@@ -84,16 +84,22 @@ def expand(compressed: Array, exposure: float) -> Array:
     return compressed / (1 - compressed) * np.float32(exposure)
 
 
-def measure_exposure(radiance: Array) -> float:
+def measure_exposure(*images: Array) -> float:
     """Return the mean radiance of the lit part of an image (H, W, C), with its brightest hundredth clipped.
 
-    Positive, and proportional to the image; 1 for an image with less light than `NO_LIGHT`. Non-finite values are
+    Of several images the first with light counts: figures of a black frame and a lit one must not depend on the unit.
+    Positive, and proportional to the image; 1 without an image of more light than `NO_LIGHT`. Non-finite values are
     excluded. The image is divided into bins of at most 16×16 pixels. A bin is lit where its mean exceeds `LIT` times
     the result, so that an object on black has the exposure of the object alone. Single pixels do not show whether a
     surface is lit: in noisy images many of its pixels are black.
     """
+    return next((exposure for exposure in map(_mean_of_lit, images) if exposure > NO_LIGHT), 1.0)
+
+
+def _mean_of_lit(radiance: Array) -> float:
+    """The exposure of an image, 0 without light."""
     if radiance.size == 0:
-        return 1.0
+        return 0.0
     rows, columns = (_edges(size) for size in radiance.shape[:2])
     level = np.empty(radiance.shape[:2], np.float32)
     sums, counts = np.zeros((2, len(rows) - 1, len(columns) - 1))
@@ -116,7 +122,7 @@ def measure_exposure(radiance: Array) -> float:
         if (still_lit == lit).all():
             break
         lit = still_lit
-    return exposure if exposure > NO_LIGHT else 1.0
+    return exposure
 
 
 def measure_gain(picture: Array, dark: float = DIM) -> float:

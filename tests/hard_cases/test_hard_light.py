@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from hybrid.arrays import denoise_arrays
 from hybrid.comparison.metrics import psnr
 from hybrid.first_pass import Classical
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, STANDARD
@@ -51,6 +52,25 @@ def test_the_network_scales_with_the_light(network, record_property):
         image = network["float32"](align(shot(scale=scale), first_pass=Classical(STANDARD))).color
         assert np.abs(image / np.float32(scale) - plain).max() < 1e-3 * plain.mean()
     record_property("cases", len(SCALES))
+
+
+@pytest.mark.neural
+@pytest.mark.parametrize("options", [{"preset": "final"}, {"preset": "fast", "first_pass": "bundled"}], ids=str)
+def test_frames_beside_a_black_one_scale_with_the_light(options):
+    """Pairs with a black frame were compared by an exposure of 1, and networks leave a little light on black."""
+    pytest.importorskip("torch")
+    unit = np.float32(2.0**-12)
+
+    def layers(frame, scale):
+        color = frame.color * scale * np.float32(frame.number != MIDDLE)
+        return {"color": color, "albedo": frame.albedo, "normal": frame.normal}
+
+    frames = shot()
+    plain, dark = (denoise_arrays([layers(frame, scale) for frame in frames], **options) for scale in (1, unit))
+    for one, other in zip(plain, dark, strict=True):
+        color = one.layers["color"]
+        assert np.abs(other.layers["color"] / unit - color).max() <= 1e-3 * max(color.mean(), 1e-6)
+        assert color.any() == (frames[one.number].number != MIDDLE)
 
 
 @pytest.mark.neural
