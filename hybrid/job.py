@@ -451,8 +451,10 @@ class Job:
         if options.method != "network" and shot.aovs:
             raise ValueError(f"--aov: {options.method} denoises the color alone, expected none, got {shot.aovs[0]!r}")
         with validating or nullcontext():
-            if options.max_memory is not None:  # even with no stage, before any pixel is read
-                plan_memory(parse_size(options.max_memory), shot.views[0], ())
+            if options.max_memory is not None:  # before any pixel is read
+                view, allowed = shot.views[0], options.rules.allowed
+                limit = parse_size(options.max_memory) // len(shot.views)
+                plan_memory(limit, view, allowed, radius=denoiser.radius, network=denoiser.memory)
             views, report = validate_views(shot, strict=options.strict)
             _check_views(views, report, options)
         if options.preset == "auto":
@@ -512,7 +514,7 @@ class Job:
     def plan_memory(self) -> MemoryPlan:
         """How the run stays within its limit, if it has one; ValueError where not even a band of rows fits."""
         if self.options.max_memory is None:
-            return MemoryPlan(None, in_files=False, background=True)
+            return MemoryPlan(None, in_files=False, trims=False, background=True)
         return plan_memory(
             parse_size(self.options.max_memory) // len(self.views),
             self.views[0],

@@ -67,6 +67,7 @@ class RunSettings:
 
     rows: int | None = None  # how many rows of a frame to work on at a time (`hybrid.memory.plan_memory`); None for all
     in_files: bool = False  # whether what is kept for later windows lies in temporary files
+    trims: bool = False  # whether freed memory is returned to the system before stages that take much of it
     # whether to read and write in the background, which takes the memory of one frame read and one written
     background: bool = True
     # leave frames alone that are there, whole, and would be the same: with these attributes, of the same files
@@ -170,7 +171,7 @@ class _ShotDenoiser:
         self.support = temporal_support(views[0].first_pass, radius, rules)
         self.sources = sources_of(views, radius, rules, settings.sources)
         self.readers = [Prefetcher(view.shot, thread, timings) for view in views]
-        self.denoisers, keeper = [], Keeper(in_files=settings.in_files)
+        self.denoisers, keeper = [], Keeper(in_files=settings.in_files, trims=settings.trims)
         for reader, view in zip(self.readers, views, strict=True):
             stream = FrameStream(
                 reader,
