@@ -1,6 +1,7 @@
 """A scene's noisy and denoised files, the passes that ravg needs, and settings that would spoil the result."""
 
 import functools
+import glob
 import json
 import os
 import re
@@ -51,7 +52,7 @@ def _of_frames(scene: bpy.types.Scene) -> Iterator[Problem]:
     if not scene.ravg.lent and would_be_written_over(scene):  # `override` sets this path for ravg's own render
         yield Problem("Output Path is that of ravg's frames: Render Animation skips them, name another", False)
     if nodes := file_outputs(scene):
-        text = f"{', '.join(nodes)}: the folder is that of ravg's frames, and nothing is written, name another"
+        text = f"{', '.join(nodes.values())}: the folder is that of ravg's frames, and nothing is written, name another"
         yield Problem(text, False)
 
 
@@ -189,19 +190,46 @@ def would_be_written_over(scene: bpy.types.Scene) -> list[Path]:
 
 
 def file_outputs(scene: bpy.types.Scene) -> dict[str, str]:
-    """Name of a File Output node that writes to a folder of ravg's frames → path of the node in the scene."""
-    tree = "compositing_node_group" if hasattr(scene, "compositing_node_group") else "node_tree"  # since Blender 5.0
-    nodes = getattr(getattr(scene, tree), "nodes", ())
-    if not nodes or not is_placed(scene):
+    """Path in the scene of a File Output node that writes to a folder of ravg's frames → the node's name."""
+    name = "compositing_node_group" if hasattr(scene, "compositing_node_group") else "node_tree"  # since Blender 5.0
+    tree = getattr(scene, name)
+    if tree is None or not is_placed(scene):
         return {}
-    kept = {Path(noisy_pattern(scene)).parent, output_folder(scene)}
-    found = {}
-    for node in nodes:
+    kept = Path(noisy_pattern(scene)).parent, output_folder(scene)
+    found = _file_output_nodes(tree, name, set())
+    return {
+        path: node.name
+        for path, node in found
+        if any(folder.match(pattern) for pattern in _folders(node) for folder in kept)
+    }
+
+
+def _file_output_nodes(
+    tree: bpy.types.NodeTree, where: str, seen: set[bpy.types.NodeTree]
+) -> Iterator[tuple[str, bpy.types.Node]]:
+    """Yield the File Output nodes of a tree and of the groups in it, each tree once, with their paths in the scene."""
+    seen.add(tree)
+    for node in tree.nodes:
+        path = f'{where}.nodes["{bpy.utils.escape_identifier(node.name)}"]'
         if node.type == "OUTPUT_FILE":
-            folder = node.directory if hasattr(node, "directory") else node.base_path  # before Blender 5.0
-            if _absolute(folder or "//") in kept:
-                found[node.name] = f'{tree}.nodes["{bpy.utils.escape_identifier(node.name)}"]'
-    return found
+            yield path, node
+        elif (inner := getattr(node, "node_tree", None)) is not None and inner not in seen:
+            yield from _file_output_nodes(inner, f"{path}.node_tree", seen)
+
+
+def _folders(node: bpy.types.Node) -> Iterator[str]:
+    """Yield the folders that a File Output node writes to, as patterns of `Path.match`."""
+    if hasattr(node, "directory"):
+        base, names = node.directory, [node.file_name]
+    elif node.format.file_format == "OPEN_EXR_MULTILAYER":  # before Blender 5.0, here and below
+        base, *names = os.path.split(node.base_path)
+    else:
+        base, names = node.base_path, [slot.path for slot in node.file_slots]
+    for name in names:
+        # A name may begin with a folder, and be empty after it. Blender joins both, whatever the name begins with.
+        path = _absolute(os.path.join(_absolute(base or "/"), f"{name}_".lstrip("/\\")))
+        # Since Blender 5.0 braces hold variables, which may stand for any name.
+        yield re.sub(r"\{[^{}]*\}", "*", glob.escape(str(path.parent)))
 
 
 def override(scene: bpy.types.Scene, *, replace: bool) -> None:
@@ -241,7 +269,7 @@ def keep_existing(scene: bpy.types.Scene) -> list[str]:
     if kept := would_be_written_over(scene):
         settings["render.use_overwrite"] = False
         said.append(f"{len(kept)} frames of ravg in {kept[0].parent} are not written over: name another Output Path")
-    for name, path in file_outputs(scene).items():
+    for path, name in file_outputs(scene).items():
         settings[f"{path}.mute"] = True
         said.append(f"{name} does not write into the folder of ravg's frames: name another folder in the node")
     if settings:
@@ -346,4 +374,5 @@ def _is_animated(scene: bpy.types.Scene, path: str) -> bool:
 
 
 def _absolute(path: str) -> Path:
-    return Path(os.path.abspath(bpy.path.abspath(path)))
+    # Blender reads a backslash as the system's separator, as in a file that was saved on Windows.
+    return Path(os.path.abspath(bpy.path.abspath(path).replace("\\", os.sep)))

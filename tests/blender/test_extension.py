@@ -780,6 +780,78 @@ answer += [files.mute, scene.render.use_overwrite, scene.ravg.lent]
     assert after == [False, True, ""]
 
 
+@pytest.mark.parametrize(
+    ("directory", "name", "found"),
+    [
+        ("//", "frames/shot_", True),
+        ("//frames", "", True),
+        ("//frames/", "denoised/", True),
+        ("//frames/denoised/extra", "../shot_", True),
+        ("//frames\\denoised\\", "/shot_", True),
+        ("//frames", "de{node_name}/shot_", True),
+        ("//{scene_name}/", "shot_", True),
+        ("//frames/", "extra/shot_", False),
+        ("//frames/{scene_name}/extra", "shot_", False),
+        ("//else", "frames_", False),
+        ("", "frames/shot_", False),
+    ],
+)
+def test_a_file_output_node_is_found_by_folder_and_name_within_groups_too(blender, shot, directory, name, found):
+    code = f"""{PROBLEMS}
+outer, inner = (bpy.data.node_groups.new(name, "CompositorNodeTree") for name in ("Outer", "Inner"))
+scene.compositing_node_group = outer
+for _ in range(2):
+    outer.nodes.new("CompositorNodeGroup").node_tree = inner
+files = inner.nodes.new("CompositorNodeOutputFile")
+files.directory, files.file_name = DIRECTORY, FILE_NAME
+said = [problem.text for problem in scenes.problems(scene)]
+scenes.keep_existing(scene)
+muted = files.mute
+scenes.restore(scene)
+answer = [said, muted, files.mute]
+"""
+    said, muted, after = blender.run(code, blend=shot, DIRECTORY=directory, FILE_NAME=name)
+    assert [text.partition(":")[0] for text in said] == ["File Output"] * found
+    assert (muted, after) == (found, False)
+
+
+def test_a_file_output_node_inside_a_group_does_not_write_over_the_frames_of_ravg(blender, shot):
+    before = contents(shot.parent / "frames")
+    code = f"""
+exec({COMPOSE!r})
+group = bpy.data.node_groups.new("Group", "CompositorNodeTree")
+group.interface.new_socket("Image", in_out="INPUT", socket_type="NodeSocketColor")
+files = group.nodes.new("CompositorNodeOutputFile")
+files.format.media_type = "MULTI_LAYER_IMAGE"
+files.file_output_items.new("RGBA", "Image")
+group.links.new(group.nodes.new("NodeGroupInput").outputs[0], files.inputs[0])
+outer = tree.nodes.new("CompositorNodeGroup")
+outer.node_tree = group
+tree.links.new(next(n for n in tree.nodes if n.type == "IMAGE").outputs["Combined"], outer.inputs[0])
+for files.directory, files.file_name in (("//else/", "shot_"), ("//", "frames/shot_")):
+    scene.render.filepath = f"//movie/{{files.file_name.replace('/', '')}}"
+    bpy.ops.render.render(animation=True)
+answer = files.mute
+"""
+    shutil.copytree(shot.parent / "frames", shot.parent / "frames" / "denoised")
+    assert blender.run(code, blend=shot) is False
+    assert contents(shot.parent / "else").keys() == before.keys()
+    assert contents(shot.parent / "frames") == before
+
+
+def test_file_output_nodes_of_blender_before_5_are_found_too(blender, shot):
+    code = """
+    from types import SimpleNamespace
+    from bl_ext.user_default.ravg import scenes
+    def folders(kind, base, *slots):
+        slots = [SimpleNamespace(path=path) for path in slots]
+        node = SimpleNamespace(format=SimpleNamespace(file_format=kind), base_path=base, file_slots=slots)
+        return [str(Path(path).relative_to(bpy.path.abspath("//"))) for path in scenes._folders(node)]
+    answer = [folders("OPEN_EXR", "//", "a/b_", "c/", "d"), folders("OPEN_EXR_MULTILAYER", "//a/b_", "c")]
+    """
+    assert blender.run(code, blend=shot) == [["a", "c", "."], ["a"]]
+
+
 # Contents of an artist's file: nodes on two view layers, a File Output node, a strip in the sequencer.
 NODES = """
 layers = [scene.view_layers[0].name, scene.view_layers.new("fog bank").name]
