@@ -260,11 +260,13 @@ def stop_current(*_: Any) -> None:
     """End the current job, as its file or the extension is closed."""
     global current
     if current is not None:
-        current.cancel()
-        if current.run is not None:
-            current.run.wait()
-        current.conclude(lambda *_: None)
-        current = None
+        try:
+            current.cancel()
+            if current.run is not None:
+                current.run.wait()
+            current.conclude(lambda *_: None)
+        finally:
+            current = None
 
 
 @bpy.app.handlers.persistent

@@ -278,11 +278,14 @@ def keep_existing(scene: bpy.types.Scene) -> list[str]:
 
 
 def restore(scene: bpy.types.Scene) -> None:
-    """Restore the scene's own render settings."""
-    if scene.ravg.lent:
-        for path, value in json.loads(scene.ravg.lent).items():
-            _set(scene, path, value)
+    """Restore the scene's own render settings, except those of nodes that were renamed or removed meanwhile."""
+    if lent := scene.ravg.lent:
         scene.ravg.lent = ""
+        for path, value in json.loads(lent).items():
+            try:
+                _set(scene, path, value)
+            except (AttributeError, TypeError, ValueError) as error:
+                print(f"ravg: {path} is not restored to {value}: {error}")
 
 
 def _override(scene: bpy.types.Scene, settings: dict[str, object]) -> None:

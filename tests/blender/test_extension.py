@@ -852,6 +852,37 @@ def test_file_output_nodes_of_blender_before_5_are_found_too(blender, shot):
     assert blender.run(code, blend=shot) == [["a", "c", "."], ["a"]]
 
 
+@pytest.mark.parametrize("change", ["files.name = 'Renamed'", "tree.nodes.remove(files)", "tree = None"])
+def test_other_settings_are_restored_where_a_muted_node_is_gone(blender, shot, change):
+    code = f"""{PROBLEMS}
+tree = scene.compositing_node_group = bpy.data.node_groups.new("Mine", "CompositorNodeTree")
+files = tree.nodes.new("CompositorNodeOutputFile")
+files.directory, scene.render.filepath = "//frames/", "//frames/shot_"
+scene.render.image_settings.media_type = "MULTI_LAYER_IMAGE"
+scenes.keep_existing(scene)
+lent = [scene.render.use_overwrite, files.mute]
+{change}
+scene.compositing_node_group = tree
+scenes.restore(scene)
+answer = [lent, scene.render.use_overwrite, scene.ravg.lent]
+"""
+    assert blender.run(code, blend=shot) == [[False, True], True, ""]
+
+
+def test_buttons_are_free_after_a_job_whose_end_fails(blender, stub, rendered):
+    code = """
+    from bl_ext.user_default.ravg import jobs
+    def fail(report):
+        raise RuntimeError("conclude")
+    jobs.begin(scene).conclude = fail
+    try:
+        jobs.stop_current()
+    except RuntimeError as error:
+        answer = [str(error), bpy.ops.ravg.denoise.poll()]
+    """
+    assert blender.run(code, blend=rendered, command=stub) == ["conclude", True]
+
+
 # Contents of an artist's file: nodes on two view layers, a File Output node, a strip in the sequencer.
 NODES = """
 layers = [scene.view_layers[0].name, scene.view_layers.new("fog bank").name]
