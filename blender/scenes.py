@@ -163,7 +163,11 @@ def refused(scene: bpy.types.Scene) -> str:
     """Return which file on disk is no noisy frame, and why; empty if all are."""
     cycles = scene.render.engine == "CYCLES"
     for path in rendered_files(scene).values():
-        if reason := _refusal(path, path.stat().st_mtime_ns, cycles):
+        try:
+            reason = _refusal(path, path.stat().st_mtime_ns, cycles)
+        except OSError as error:  # a link to nothing, or a file that was removed meanwhile
+            reason = f"it cannot be read ({error.strerror})"
+        if reason:
             return f"{path.name} is no noisy frame: {reason}"
     return ""
 

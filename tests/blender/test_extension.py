@@ -1001,6 +1001,16 @@ answer += [texts()]
     assert said[0].startswith("shot_0004.exr")
 
 
+def test_a_link_to_nothing_is_named_as_a_frame_that_cannot_be_read(blender, stub, shot):
+    frame = shot.parent / "frames" / "shot_0005.exr"
+    frame.unlink()
+    frame.symlink_to("gone.exr")
+    error, free, _, said = blender.run(f"{PROBLEMS}{FAILING}\nanswer += [texts()]", blend=shot, command=stub)
+    assert "shot_0005.exr is no noisy frame: it cannot be read (No such file or directory)" in error
+    assert free
+    assert said == ["shot_0005.exr"]
+
+
 # --- installing ravg -----------------------------------------------------------------------------------
 
 
