@@ -80,9 +80,13 @@ class Denoise(_WhenIdle, bpy.types.Operator):
         if there and self.existing == "ASK":
             which = f"noisy frames {frames.ranges(there)} are there already"
             raise FileExistsError(f"{which}: render with existing='KEEP' or 'REPLACE', or denoise them")
+        if bpy.app.is_job_running("RENDER"):  # whose settings `override` would change
+            raise RuntimeError("Blender is rendering: wait for its end, or stop it")
         scenes.set_up(scene)
         scenes.override(scene, replace=self.existing == "REPLACE")
-        bpy.ops.render.render("EXEC_DEFAULT" if self.wait else "INVOKE_DEFAULT", animation=True, scene=scene.name)
+        how = "EXEC_DEFAULT" if self.wait else "INVOKE_DEFAULT"
+        if bpy.ops.render.render(how, animation=True, scene=scene.name) == {"CANCELLED"}:
+            raise RuntimeError("Blender has not rendered the frames: its console may say why")
 
 
 class Install(_WhenIdle, bpy.types.Operator):

@@ -1161,6 +1161,34 @@ def test_an_error_of_ravg_is_an_error_in_blender(blender, shot):
     assert log
 
 
+@pytest.mark.parametrize(
+    ("running", "answer", "reason"),
+    [
+        (True, {"RUNNING_MODAL"}, "Blender is rendering: wait for its end, or stop it"),
+        (False, {"CANCELLED"}, "Blender has not rendered the frames: its console may say why"),
+    ],
+)
+def test_a_render_that_does_not_start_is_an_error_and_leaves_the_settings(
+    blender, stub, blend, running, answer, reason
+):
+    code = """
+    from types import SimpleNamespace
+    from bl_ext.user_default.ravg import jobs, operators
+    rendered, reports = [], []
+    def render(*how, **options):
+        rendered.append(scene.render.filepath)
+        return ANSWER
+    app = SimpleNamespace(is_job_running=lambda kind: RUNNING)
+    operators.bpy = SimpleNamespace(app=app, ops=SimpleNamespace(render=SimpleNamespace(render=render)))
+    operator = SimpleNamespace(render=True, wait=False, existing="ASK", report=lambda kind, text: reports.append(text))
+    operator._begin = lambda scene: operators.Denoise._begin(operator, scene)
+    done = operators.Denoise.execute(operator, bpy.context)
+    answer = [list(done), reports, len(rendered), scene.render.filepath, scene.ravg.lent, jobs.current]
+    """
+    found = blender.run(code, blend=blend, command=stub, RUNNING=running, ANSWER=answer)
+    assert found == [["CANCELLED"], [reason], 0 if running else 1, "//movie/shot_", "", None]
+
+
 def test_there_is_nothing_to_show_before_it_has_run(blender, shot):
     code = FAILING.replace("ravg.denoise()", "ravg.show()")
     assert "no denoised frames" in blender.run(code, blend=shot)[0]
