@@ -36,6 +36,7 @@ class Version:
 
     def __init__(self, executable: str) -> None:
         self.executable = executable
+        self._file = _version(Path(executable))
         self._text = ""
         try:
             self._process: subprocess.Popen[str] | None = subprocess.Popen(
@@ -45,6 +46,10 @@ class Version:
         except OSError as error:
             self._process = None
             self._text = str(error)
+
+    def is_of(self, executable: str) -> bool:
+        """Whether the answer is that of a command, which may have been replaced."""
+        return executable == self.executable and _version(Path(executable)) == self._file
 
     @property
     def known(self) -> bool:

@@ -199,10 +199,12 @@ def ravg_problem(*, wait: bool) -> str:
         executable = settings.executable()
     except FileNotFoundError as error:
         return str(error)
-    if _version is None or _version.executable != executable:
+    expected = install.series(settings.version())
+    # After a problem ask again: a slow command may answer now, and one in an editable clone may be of another version.
+    if _version is None or not _version.is_of(executable) or (wait and _version.known and _version.problem(expected)):
         _version = command.Version(executable)
         bpy.app.timers.register(_redraw_when_known, first_interval=INTERVAL)
-    return _version.problem(install.series(settings.version())) if wait or _version.known else ""
+    return _version.problem(expected) if wait or _version.known else ""
 
 
 def _redraw_when_known() -> float | None:

@@ -1130,6 +1130,32 @@ answer += [draw()]
     assert "Install ravg" in drawn
 
 
+@pytest.mark.parametrize(("replaced", "seen"), [(True, [True, False]), (False, [True, True])])
+def test_a_command_that_was_updated_is_asked_again(blender, shot, tmp_path, replaced, seen):
+    """The panel sees a new file; the button asks again too, as the file of an editable clone stays the same."""
+    tool, text = tmp_path / "ravg", tmp_path / "text"
+    tool.write_text(f"#!{sys.executable}\nprint(open({str(text)!r}).read())\n", encoding="utf-8")
+    tool.chmod(0o755)
+    text.write_text("ravg 99.2.5", encoding="ascii")
+    code = f"""
+    from bl_ext.user_default.ravg import jobs
+    tool = Path({str(tool)!r})
+    def drawn():
+        jobs.ravg_problem(wait=False)
+        while not jobs._version.known:
+            time.sleep(0.05)
+        return bool(jobs.ravg_problem(wait=False))
+    answer = [drawn()]
+    Path({str(text)!r}).write_text("ravg {VERSION}")
+    if REPLACED:
+        tool.with_name("new").write_text(tool.read_text())
+        tool.with_name("new").chmod(0o755)
+        tool.with_name("new").replace(tool)
+    answer += [drawn(), jobs.ravg_problem(wait=True)]
+    """
+    assert blender.run(code, blend=shot, command=str(tool), REPLACED=replaced) == [*seen, ""]
+
+
 # --- what goes wrong -----------------------------------------------------------------------------------
 
 FAILING = """
