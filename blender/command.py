@@ -78,7 +78,7 @@ class Run:
     """A running command whose output goes to `log`; raises OSError if the command cannot be started.
 
     `outputs` are the files that it will write. Each is renamed into its place when complete, so that counting them
-    measures the progress.
+    measures the progress, but for frames that `--resume` leaves alone.
     """
 
     def __init__(self, arguments: Sequence[str], outputs: Iterable[Path], log: Path) -> None:
@@ -97,8 +97,10 @@ class Run:
 
     @property
     def finished(self) -> int:
-        """The number of frames that this run has made."""
-        return sum(_version(path) not in (None, before) for path, before in self._before.items())
+        """The number of finished frames; of those that were there before, only the log tells, up to a percent late."""
+        made = sum(_version(path) not in (None, before) for path, before in self._before.items())
+        counted = re.findall(r": (\d+) of \d+ frames(?:, \d+ %| are finished)", self.log)
+        return max([made, *map(int, counted[-1:])])
 
     @property
     def stopped(self) -> bool:

@@ -60,6 +60,23 @@ open(".half.tmp", "wb").write(b"ha")
     assert (made.finished, made.total) == (2, 4)
 
 
+@pytest.mark.parametrize(
+    ("last", "count"),
+    [
+        ("Passes      color, 1 of 2 frames", 0),
+        ("denoise: 0 of 3 frames, 0 %", 0),
+        ("frame 5 was there: 2 of 3 frames, 67 %, about 0 s left", 2),
+        ("error: stopped: 2 of 3 frames are finished, the last is 5; --resume goes on from there", 2),
+    ],
+)
+def test_frames_that_were_there_count_when_the_log_tells_of_them(tmp_path, last, count):
+    there = tmp_path / "there.exr"
+    there.write_bytes(b"before")
+    resumed = run(f"print('denoise: 0 of 3 frames, 0 %'); print({last!r})", tmp_path, [there, tmp_path / "gone.exr"])
+    assert resumed.wait() == 0
+    assert resumed.finished == count
+
+
 def test_what_goes_wrong_is_told_in_one_line(tmp_path):
     failed = run(
         "import sys; print('stages: warp'); print('error: out of luck', file=sys.stderr); sys.exit(1)", tmp_path

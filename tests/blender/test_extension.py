@@ -467,13 +467,18 @@ def test_resume_leaves_finished_frames_alone(blender, shot):
     made = Path(bpy.path.abspath("//frames/denoised"))
     first = {p.name: p.stat().st_mtime_ns for p in made.glob("*.exr")}
     (made / "shot_0005.exr").unlink()
-    bpy.ops.ravg.denoise()
+    from bl_ext.user_default.ravg import jobs
+    job = jobs.begin(scene)
+    job.start()
+    jobs.wait()
+    bpy.ops.ravg.conclude()
     second = {p.name: p.stat().st_mtime_ns for p in made.glob("*.exr")}
-    answer = [sorted(second), sorted(name for name in second if first[name] == second[name])]
+    answer = [sorted(second), sorted(name for name in second if first[name] == second[name]), job.run.finished]
     """
-    there, kept = blender.run(code, blend=shot)
+    there, kept, finished = blender.run(code, blend=shot)
     assert there == ["shot_0004.exr", "shot_0005.exr", "shot_0006.exr"]
     assert kept == ["shot_0004.exr", "shot_0006.exr"]
+    assert finished == 3
 
 
 LIGHT = ("Diffuse Direct", "Diffuse Indirect", "Glossy Direct", "Glossy Indirect")
