@@ -29,6 +29,7 @@ class Job:
         self.rendered = False
         self.cancelled = False
         self.error = ""
+        self._finished, self._remaining = 0, ""
 
     @property
     def scene(self) -> bpy.types.Scene | None:
@@ -67,7 +68,7 @@ class Job:
         self.run = command.Run(arguments, [outputs[number] for number in there], log)
 
     def advance(self) -> None:
-        """When Blender has rendered, restore the scene's settings and start `ravg`."""
+        """When Blender has rendered, restore the scene's settings and start `ravg`; see how far it is."""
         if self.run is None and (self.rendered or self.cancelled):
             self._restore()
             if not self.cancelled:
@@ -76,19 +77,21 @@ class Job:
                 except (OSError, ValueError) as error:
                     self.error = str(error)
                     self.cancel()
+        if self.run is not None:  # not where it is drawn, which may be more often
+            self._finished, self._remaining = self.run.finished, self.run.remaining
 
     @property
     def factor(self) -> float:
         """The progress, from 0 to 1."""
-        return 0.0 if self.run is None else self.run.finished / self.run.total
+        return 0.0 if self.run is None else self._finished / self.run.total
 
     @property
     def text(self) -> str:
         """The progress in words."""
         if self.run is None:
             return "Rendering"
-        text = f"Denoising: {self.run.finished} of {self.run.total} frames"
-        return f"{text}, {self.run.remaining} left" if self.run.remaining else text
+        text = f"Denoising: {self._finished} of {self.run.total} frames"
+        return f"{text}, {self._remaining} left" if self._remaining else text
 
     def cancel(self) -> None:
         """Stop `ravg`, or do not start it."""

@@ -21,7 +21,8 @@ class OutputPanel(bpy.types.Panel):
         layout, scene = self.layout, context.scene
         layout.use_property_split = True
         layout.use_property_decorate = False
-        job, problems, missing = jobs.current, scenes.problems(scene), jobs.ravg_problem(wait=False)
+        job, missing = jobs.current, jobs.ravg_problem(wait=False)
+        problems = scenes.problems(scene) if job is None else []  # all frames are looked at, and a job draws often
         if problems or missing:
             column = layout.box().column(align=True)
             if missing:

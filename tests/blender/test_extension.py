@@ -376,6 +376,7 @@ while (pause := jobs.follow()) is not None:
     seen.append(job.text)
     {between}
     time.sleep(pause)
+job.advance()
 answer = [sorted(set(seen)), jobs.current is None, bpy.ops.ravg.denoise.poll(), job.run.code, job.run.finished,
           job.text]
 """
@@ -1269,3 +1270,27 @@ def test_the_panel_of_a_job_shows_how_far_it_is_and_a_way_to_stop_it(blender, st
     code = f"{DRAWN}{begin}; answer = draw()"
     drawn = blender.run(code, blend=rendered, command=stub)
     assert drawn == ["Preset", "Light Passes", "Noisy Frames", "Denoised Frames", "Resume", "Rendering", "Stop"]
+
+
+def test_the_panel_of_a_job_looks_at_no_frame(blender, shot, tmp_path):
+    """It is drawn four times a second and more: looking at a thousand frames on a server would take longer."""
+    tool = tmp_path / "ravg"
+    listens = f"print('ravg {VERSION}')\nif 'denoise' in sys.argv: sys.stdin.read()\n"
+    tool.write_text(f"#!{sys.executable}\nimport sys\n{listens}", encoding="utf-8")
+    tool.chmod(0o755)
+    code = f"""{DRAWN}
+scene.frame_end = 7
+job = jobs.begin(scene)
+job.start()
+jobs.follow()
+looked = []
+sys.addaudithook(lambda event, found: looked.append(str(found)) if event == "os.listdir" else None)
+stat = Path.stat
+Path.stat = lambda path, **how: looked.append(str(path)) or stat(path, **how)
+answer = [draw()[-2:], [path for path in looked if "frames" in path]]
+Path.stat = stat
+jobs.stop_current()
+"""
+    drawn, looked = blender.run(code, blend=shot, command=str(tool))
+    assert drawn == ["Denoising: 0 of 3 frames", "Stop"]
+    assert looked == []
