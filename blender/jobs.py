@@ -23,8 +23,8 @@ class Job:
         self._scene = scene.session_uid  # a name may change
         if reason := ravg_problem(wait=True):
             raise FileNotFoundError(reason)
-        if not scenes.is_placed(scene):
-            raise FileNotFoundError("the file is not saved: save it, or name a folder in Noisy Frames")
+        if reason := scenes.misplaced(scene):
+            raise FileNotFoundError(reason)
         self.run: command.Run | None = None
         self.rendered = False
         self.cancelled = False

@@ -32,8 +32,8 @@ class Problem(NamedTuple):
 
 def problems(scene: bpy.types.Scene) -> list[Problem]:
     """Return what prevents denoising or makes the result worse, with the remedy, the gravest first."""
-    if not is_placed(scene):
-        return [Problem("File is not saved: save it, or name a folder in Noisy Frames", False)]
+    if reason := misplaced(scene):
+        return [Problem(reason, False)]
     return [*_of_frames(scene), *_of_passes(scene)]
 
 
@@ -157,6 +157,18 @@ def denoised_files(scene: bpy.types.Scene) -> dict[int, Path]:
 def is_placed(scene: bpy.types.Scene) -> bool:
     """Whether the folder of the noisy frames is known; without a setting it is that of the saved file."""
     return bool(bpy.data.filepath) or bool(scene.ravg.noisy and not scene.ravg.noisy.startswith("//"))
+
+
+def misplaced(scene: bpy.types.Scene) -> str:
+    """Return why no frames can be rendered or denoised with the scene's paths, and the remedy; empty if they can."""
+    chosen = scene.ravg
+    if "{" in chosen.noisy or "}" in chosen.noisy:
+        return "Noisy Frames has { or }: ravg fills in no variables of Blender, write out the path"
+    # Without a file, other paths lead to the folder that Blender was started in.
+    paths = chosen.noisy, chosen.folder or chosen.noisy
+    if bpy.data.filepath or all(os.path.isabs(path) and not path.startswith("//") for path in paths):
+        return ""
+    return "File is not saved: save it, or write out the paths of Noisy Frames and Denoised Frames"
 
 
 def refused(scene: bpy.types.Scene) -> str:

@@ -286,7 +286,6 @@ def test_the_rendered_frames_hold_what_ravg_reads(rendered):
         ("//sh#t/v1_", "sh#t/v1_####.exr", "sh#t/v1_0005.exr"),
         ("//12/00##_a", "12/00##_a.exr", "12/0005_a.exr"),
         ("//", "####.exr", "0005.exr"),
-        ("//{x}/{blend_name}_", "{x}/{blend_name}_####.exr", "{x}/{blend_name}_0005.exr"),
         ("//a.EXR", "a####.exr", "a0005.exr"),
     ],
 )
@@ -299,6 +298,48 @@ answer = [scenes.noisy_pattern(scene), scenes.noisy_files(scene)[5]]
 """
     found = blender.run(code, blend=rendered, PATH=filepath)
     assert found == [str(rendered.parent / pattern), str(rendered.parent / fifth)]
+
+
+@pytest.mark.parametrize(
+    ("saved", "noisy", "folder", "reason"),
+    [
+        (False, "", "", "File is not saved"),
+        (False, "//frames/", "", "File is not saved"),
+        (False, "frames/shot_", "", "File is not saved"),
+        (False, "", "/tmp/denoised", "File is not saved"),
+        (False, "/tmp/noisy_", "//denoised", "File is not saved"),
+        (False, "/tmp/noisy_", "denoised", "File is not saved"),
+        (False, "/tmp/noisy_", "", ""),
+        (False, "/tmp/noisy_", "/tmp/denoised", ""),
+        (True, "//frames/shot_", "//denoised", ""),
+        (True, "//{blend_name}/shot_", "", "Noisy Frames has { or }"),
+        (True, "/tmp/shot}_", "", "Noisy Frames has { or }"),
+    ],
+)
+def test_paths_that_lead_elsewhere_are_refused(blender, stub, blend, saved, noisy, folder, reason):
+    code = f"""{PROBLEMS}
+from bl_ext.user_default.ravg import jobs
+scene.ravg.noisy, scene.ravg.folder = NOISY, FOLDER
+answer = [[problem.text for problem in scenes.problems(scene)], ""]
+try:
+    jobs.begin(scene)
+except FileNotFoundError as error:
+    answer[1] = str(error)
+"""
+    said, refused = blender.run(code, blend=blend if saved else None, command=stub, NOISY=noisy, FOLDER=folder)
+    assert refused.partition(":")[0] == reason
+    assert ([refused] == said) == bool(reason)
+
+
+def test_braces_in_the_folder_of_the_file_are_no_variables(blender, blend):
+    folder = blend.parent / "{blend_name}"
+    folder.mkdir()
+    code = f"""{PROBLEMS}
+scenes.override(scene, replace=True)
+answer = [scenes.misplaced(scene), scene.render.frame_path(frame=5)]
+"""
+    written = str(folder / "ravg" / "shot" / "noisy" / "Scene_0005.exr")
+    assert blender.run(code, blend=Path(shutil.copy(blend, folder))) == ["", written]
 
 
 # --- from one button to the picture --------------------------------------------------------------------
