@@ -28,6 +28,7 @@ EXISTING = (
     ("KEEP", "Render Missing Frames", "Keep the existing noisy frames"),
     ("REPLACE", "Render All Again", "Replace the existing noisy frames"),
 )
+CHOICE = "existing='KEEP' or 'REPLACE'"  # the command line has other names
 
 
 class _WhenIdle:
@@ -79,7 +80,7 @@ class Denoise(_WhenIdle, bpy.types.Operator):
             return
         if there and self.existing == "ASK":
             which = f"noisy frames {frames.ranges(there)} are there already"
-            raise FileExistsError(f"{which}: render with existing='KEEP' or 'REPLACE', or denoise them")
+            raise FileExistsError(f"{which}: render with {CHOICE}, or denoise them")
         if bpy.app.is_job_running("RENDER"):  # whose settings `override` would change
             raise RuntimeError("Blender is rendering: wait for its end, or stop it")
         scenes.set_up(scene)

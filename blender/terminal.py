@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 import bpy
 
+from . import operators
+
 NAME = "ravg"
 
 
@@ -23,6 +25,6 @@ def run(arguments: Sequence[str]) -> int:
     try:
         done = bpy.ops.ravg.denoise(render=chosen.render, existing=chosen.existing or "ASK")
     except RuntimeError as error:
-        print(str(error).strip(), file=sys.stderr)
+        print(str(error).strip().replace(operators.CHOICE, "--keep or --replace"), file=sys.stderr)
         return 1
     return 0 if done == {"FINISHED"} else 1

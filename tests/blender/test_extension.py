@@ -616,7 +616,7 @@ def test_motion_blur_is_added_after_denoising_as_the_documentation_says(blender,
     ("arguments", "code", "says"),
     [
         ([], 0, "3 of 3 frames, 100 %"),
-        (["--render"], 1, "noisy frames 4-6 are there already"),
+        (["--render"], 1, "noisy frames 4-6 are there already: render with --keep or --replace, or denoise them"),
         (["--render", "--keep"], 0, "3 of 3 frames, 100 %"),
         (["--render", "--keep", "--replace"], 2, "not allowed with argument"),
         (["--no-such"], 2, "unrecognized arguments"),
