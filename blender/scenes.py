@@ -39,6 +39,10 @@ def problems(scene: bpy.types.Scene) -> list[Problem]:
 
 def _of_frames(scene: bpy.types.Scene) -> Iterator[Problem]:
     """Yield the problems of the frames on disk, and of those that a render would replace."""
+    pattern = Path(noisy_pattern(scene))
+    for other in bpy.data.scenes:  # default paths hold only the letters and digits of a scene's name
+        if other != scene and Path(noisy_pattern(other)) == pattern:
+            yield Problem(f"Scene {other.name} has these Noisy Frames too: both write them, choose another path", False)
     if reason := refused(scene):
         yield Problem(f"{reason} (Render and Denoise renders all again)", False)
     missing = set(frame_numbers(scene)) - rendered_files(scene).keys()

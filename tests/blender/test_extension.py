@@ -247,6 +247,12 @@ def test_a_new_scene_is_told_what_it_lacks_and_set_up(blender, blend):
         ("scene.cycles.use_animated_seed = False; scene.cycles.keyframe_insert('seed', frame=1)", []),
         ("scene.view_layers.new('second')", ["Denoising Data", "Vector pass"]),
         ("scene.view_layers.new('second').use = False", []),
+        ("scene.copy().ravg.noisy = '//frames/other_'", []),
+        ("scene.copy()", ["Scene Scene.001 has these Noisy Frames too"]),
+        (
+            "scene.name = 'A b'; scene.ravg.noisy = ''; scene.copy().name = 'A.b'",
+            ["Scene A.b has these Noisy Frames too"],
+        ),
         ("scene.render.engine = ENGINE", ["Engine"]),
         ("scenes.with_denoiser, scene.cycles.use_denoising = False, True", ["Render > Denoise"]),
         ("scenes.with_denoiser, scene.cycles.use_denoising = False, True; scenes.set_up(scene)", []),
