@@ -40,7 +40,8 @@ def series(version: str) -> str:
 def new_environment(home: Path) -> Path:
     """A folder for a new environment; the current one stays until the new one is complete."""
     numbers = [int(name.rpartition("-")[2]) for name in _environments(home)]
-    return home / f"environment-{max(numbers, default=0) + 1}"
+    # A short name: Windows takes paths of 259 letters. Torch needs 119 in site-packages, and a user's name may be long.
+    return home / str(max(numbers, default=0) + 1)
 
 
 def steps(environment: Path, source: Source) -> list[list[str]]:
@@ -90,7 +91,8 @@ def explain(log: str, *, online: bool) -> str:
 def _environments(home: Path) -> list[str]:
     if not home.is_dir():
         return []
-    return [path.name for path in home.iterdir() if re.fullmatch(r"environment-\d+", path.name)]
+    # Earlier versions named them environment-1.
+    return [path.name for path in home.iterdir() if re.fullmatch(r"(environment-)?\d+", path.name)]
 
 
 def _program(environment: Path, name: str) -> str:

@@ -1123,13 +1123,13 @@ answer = [install(wheel=GOOD), there(), ran(), jobs.ravg_problem(wait=True), ins
     first, one, version, problem, second, two, failed, left, still = blender.run(
         code, command="", GOOD=str(wheels), BAD=str(bad / f"ravg-{VERSION}-py3-none-any.whl")
     )
-    assert (first, one) == (["FINISHED"], ["current.txt", "environment-1"])
+    assert (first, one) == (["FINISHED"], ["1", "current.txt"])
     assert (version, problem) == (f"ravg {VERSION}", "")
-    assert (second, two) == (["FINISHED"], ["current.txt", "environment-2"])
+    assert (second, two) == (["FINISHED"], ["2", "current.txt"])
     assert "ravg is not installed: " in failed
     assert "gone-for-good" in failed
     assert "Online Access is off" in failed
-    assert (left, still) == (["current.txt", "environment-2"], f"ravg {VERSION}")
+    assert (left, still) == (["2", "current.txt"], f"ravg {VERSION}")
 
 
 def test_without_a_wheel_or_a_network_the_error_says_so(blender, tmp_path):

@@ -17,9 +17,9 @@ sys.modules[spec.name] = install  # dataclasses look it up
 spec.loader.exec_module(install)
 
 
-def environment(home: Path, number: int) -> Path:
+def environment(home: Path, name: str) -> Path:
     """An environment that holds a command."""
-    made = home / f"environment-{number}"
+    made = home / name
     path = Path(install._program(made, "ravg"))
     path.parent.mkdir(parents=True)
     path.touch()
@@ -28,25 +28,32 @@ def environment(home: Path, number: int) -> Path:
 
 def test_nothing_is_installed_until_an_environment_is_complete(tmp_path):
     assert install.installed(tmp_path / "gone") == install.installed(tmp_path) == ""
-    made = environment(tmp_path, 1)
+    made = environment(tmp_path, "1")
     assert install.installed(tmp_path) == ""
     install.finish(tmp_path, made)
     assert install.installed(tmp_path) == install._program(made, "ravg")
 
 
-def test_a_new_environment_replaces_the_old_one_at_its_end_only(tmp_path):
-    install.finish(tmp_path, environment(tmp_path, 9))
+@pytest.mark.parametrize("old", ["9", "environment-9"])
+def test_a_new_environment_replaces_the_old_one_at_its_end_only(tmp_path, old):
+    install.finish(tmp_path, environment(tmp_path, old))
     new = install.new_environment(tmp_path)
-    assert new.name == "environment-10"
-    environment(tmp_path, 10)
+    assert new.name == "10"
+    environment(tmp_path, "10")
     install.remove(new)
-    assert "environment-9" in install.installed(tmp_path)
-    install.finish(tmp_path, environment(tmp_path, 10))
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["current.txt", "environment-10"]
+    assert Path(install.installed(tmp_path)).parts[-3] == old
+    install.finish(tmp_path, environment(tmp_path, "10"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["10", "current.txt"]
+
+
+def test_paths_on_windows_leave_room_for_a_name_of_26_letters(tmp_path):
+    home = "C:/Users/{}/AppData/Roaming/Blender Foundation/Blender/5.0/extensions/.user/user_default/ravg"
+    longest = f"{home.format('u' * 26)}/{install.new_environment(tmp_path).name}/Lib/site-packages/{'t' * 119}"
+    assert len(longest) <= 259
 
 
 def test_an_environment_that_was_removed_is_not_used(tmp_path):
-    made = environment(tmp_path, 1)
+    made = environment(tmp_path, "1")
     install.finish(tmp_path, made)
     install.remove(made)
     assert install.installed(tmp_path) == ""
