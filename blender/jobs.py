@@ -105,8 +105,8 @@ class Job:
 
     def conclude(self, report: Report) -> bool:
         """Restore the scene's settings and report the result; return whether all frames are made."""
-        self._restore()
-        if self.run is None:
+        if self.run is None:  # else they are restored, and what is lent may be that of another render
+            self._restore()
             if self.error:
                 report({"ERROR"}, self.error)
             return False
@@ -289,23 +289,29 @@ def protect(scene: bpy.types.Scene, *_: Any) -> None:
             print(f"ravg: {message}")
 
 
-# Handlers run in another thread while Blender still reads the scene, so they only set flags for the timer.
+# Handlers run in another thread while Blender still reads the scene. They leave to the timer what belongs to a job, and
+# restore only what `protect` has changed for a render of the user's.
 @bpy.app.handlers.persistent
 def completed(scene: bpy.types.Scene, *_: Any) -> None:
     """Let the timer start `ravg` where a job waits for this render; else restore what `protect` has changed."""
-    if current is None or current.scene != scene:
+    if (job := _waiting(scene)) is not None:
+        job.rendered = True
+    else:
         scenes.restore(scene)
-    elif current.run is None:
-        current.rendered = True
 
 
 @bpy.app.handlers.persistent
 def cancelled(scene: bpy.types.Scene, *_: Any) -> None:
     """End the job that waits for this render; else restore what `protect` has changed."""
-    if current is None or current.scene != scene:
+    if (job := _waiting(scene)) is not None:
+        job.cancel()
+    else:
         scenes.restore(scene)
-    elif current.run is None:
-        current.cancel()
+
+
+def _waiting(scene: bpy.types.Scene) -> Job | None:
+    """The current job, if it waits for Blender to render a scene."""
+    return current if isinstance(current, Job) and current.scene == scene and current.run is None else None
 
 
 def redraw() -> None:

@@ -936,6 +936,30 @@ def test_buttons_are_free_after_a_job_whose_end_fails(blender, stub, rendered):
     assert blender.run(code, blend=rendered, command=stub) == ["conclude", True]
 
 
+@pytest.mark.parametrize("end", ["render_complete", "render_cancel", ""])
+def test_a_render_during_a_job_keeps_its_protection_to_its_own_end(blender, stub, shot, end):
+    code = f"""{FORMATS}
+from bl_ext.user_default.ravg import jobs
+scene.render.filepath = "//frames/shot_"
+choose("MULTI_LAYER_IMAGE", "OPEN_EXR_MULTILAYER", "32", "RGBA")
+def call(name):
+    for handler in list(getattr(bpy.app.handlers, name)): handler(scene)
+    return scene.render.use_overwrite
+job = jobs.begin(scene)
+job.start()
+answer = [call("render_init")]
+if END:
+    answer += [call(END), job.rendered, job.cancelled, job.run.stopped]
+    call("render_init")
+job.run.wait()
+jobs.current = None
+job.conclude(lambda *_: None)
+answer += [scene.render.use_overwrite, call("render_complete"), scene.ravg.lent]
+"""
+    ended = [True, False, False, False] if end else []
+    assert blender.run(code, blend=shot, command=stub, END=end) == [False, *ended, False, True, ""]
+
+
 # Contents of an artist's file: nodes on two view layers, a File Output node, a strip in the sequencer.
 NODES = """
 layers = [scene.view_layers[0].name, scene.view_layers.new("fog bank").name]
