@@ -21,7 +21,7 @@ from nlm.drift import drift_weights, pull_to_centre
 from nlm.gate import SHARE, agreement_weight, color_gate, color_gates
 from nlm.pooling import SampleRange
 from nlm.relight import relight
-from nlm.samples import average_neighbours
+from nlm.samples import SampleMean, average_neighbours
 
 # How much of a frame's noise finished pictures may differ by: up to the first as they are, up to the second without
 # their mean difference (`nlm.relight`), where the light stands still as far as samples show (`nlm.drift`). The second
@@ -56,6 +56,14 @@ class _Warped(NamedTuple):
     trust: tuple[Trust | None, ...]
 
 
+class _Trusted(NamedTuple):
+    """How far geometry and light trust each frame, and how far its light drifts."""
+
+    confidence: Array  # (T, h, W)
+    pull: Array | None = None  # (T, h, W): weights by which first passes are pulled to the centre's; None without drift
+    drift_weight: Array | None = None  # (h, W): as `AlignedWindow.drift_weight`
+
+
 class Stillness(NamedTuple):
     """How far the light of a frame stands still."""
 
@@ -85,13 +93,14 @@ def align(
     the same layers (`expect_equal_layers`). Raises ValueError if the centre has no first pass and others do.
     """
     timings = timings or Timings()
-    centre, stages, given = window.centre, window.stages, window.first_pass is not None
+    centre, stages, denoised = window.centre, window.stages, window.first_pass is not None
+    middle = len(window.frames) // 2
     padded, inner = _pad_rows(rows, len(centre.irradiance))
-    light = "gate" in stages and not given
+    light = "gate" in stages and not denoised
     layers = {name: layer[padded] for name, layer in layers_of(centre, light=light, alpha="alpha" in stages).items()}
     guides = {name: layer for name, layer in layers.items() if name in ("albedo", "normal")}
     # With a first pass few denoisers read the colors of all frames: these are warped when they are read.
-    own = layers.pop("color") if given else layers["color"]
+    centre_irradiance = layers.pop("color") if denoised else layers["color"]
     warped, coverage = _warp_neighbours(window, layers, guides, padded, timings)
     flows = [None if link is None else link.forward.vectors[padded] for link in window.links]
     sources = WarpSources(window.frames, flows, window.first_pass or (), window.limited, padded, release=window.release)
@@ -101,64 +110,53 @@ def align(
         filtered = None
         if window.filtered_guides is not None:
             filtered = average_guides(window.filtered_guides, flows, warped.confidence, padded)
-    estimates = None
-    if window.first_pass is not None:
-        estimates = _warp_first_pass(window, window.first_pass, coverage, padded, timings)
+    # The first passes of all frames, or their colors.
+    if window.first_pass is None:
+        pictures = warped.layers.pop("color")
+    else:
+        pictures = _warp_first_pass(window, window.first_pass, coverage, padded, timings)
     with timings.stage("confidence"):
-        color, own = _fill_centre(warped, own, estimates, sources)
+        centre_irradiance = _fill_centre(warped, pictures, centre_irradiance, sources)
         bright = window.lit.as_light if "light" in warped.layers else window.lit.as_rendered
-        outliers, middle = 0, len(window.frames) // 2
-        if color is not None and "outliers" in stages:
-            color, rejected = reject_outliers(color, warped.confidence)
-            own, outliers = color[middle], int(np.count_nonzero(rejected[:, inner]))
-        modulation = np.ones_like(own)
+        outliers = 0
+        if not denoised and "outliers" in stages:
+            pictures, rejected = reject_outliers(pictures, warped.confidence)
+            centre_irradiance, outliers = pictures[middle], int(np.count_nonzero(rejected[:, inner]))
+        modulation = np.ones_like(centre_irradiance)
         if clean is not None and centre.demodulated:
             modulation = remodulate(modulation, clean)
             if "prefilter" in stages:
                 sources = replace(sources, modulation=modulation)
         guided = guided or bool(centre.aovs)
         clean = clean if guided else None
-        confidence = warped.confidence
-        if estimates is not None:
+        if denoised:
             # By the centre's albedo and not by each frame's own, which may be noisy as the first pass is not.
-            estimates /= modulation
-            shares = (SHARE, DRIFTING_SHARE) if "drift" in stages else (SHARE,)
-            gates = color_gates(estimates, own, bright.exposure, shares)
-            confidence, *strict = (trust_light(confidence, coverage, gate, stages) for gate in gates)
-            del coverage, gates  # windows are large
-            if "gate" in stages:
-                agreement = agreement_weight(estimates, own, confidence, bright.exposure)
-                for trusted in (confidence, *strict):
-                    trusted[:middle] *= agreement
-                    trusted[middle + 1 :] *= agreement
-        elif "gate" in stages:
-            confidence = confidence * color_gate(warped.layers["light"], own, bright.exposure)
-        weight = pull = sides = found = residuals = None
-        if estimates is not None and "drift" in stages:
-            weight = drift_weights(estimates, own, confidence, bright.exposure, first_row=padded.start)
-            pull = _stricter_where_light_drifts(weight, confidence, strict.pop())
+            pictures /= modulation
+            confidences = _gate_denoised(
+                pictures, centre_irradiance, warped.confidence, coverage, bright.exposure, stages
+            )
+            del coverage  # windows are large
+            trusted = _trust_denoised(window, pictures, centre_irradiance, confidences, bright.exposure, padded.start)
+        else:
+            trusted = _trust_noisy(warped, centre_irradiance, bright.exposure, stages)
+        sides = found = None
         if "blend-samples" in stages:
-            if estimates is not None:
-                found = SampleRange.empty(own.shape) if ranged else None
-                residuals = _pull_behind(sources.residual_strips(), estimates, confidence, pull, found)
-            pictures = color if estimates is None else estimates
-            assert pictures is not None
-            noisy = centre.radiance[padded]
-            sides = average_neighbours(pictures, residuals, confidence, warped.confidence, modulation, noisy)
-        elif estimates is not None and pull is not None:
-            pull_to_centre(estimates, confidence, pull)
+            found = SampleRange.empty(centre_irradiance.shape) if ranged and denoised else None
+            sides = _average_samples(sources, pictures, warped.confidence, trusted, modulation, centre, found)
+        elif trusted.pull is not None:
+            pull_to_centre(pictures, trusted.confidence, trusted.pull)
     return AlignedWindow(
         number=centre.number,
-        centre_irradiance=own,
-        aligned_color=color,
+        centre_irradiance=centre_irradiance,
+        aligned_color=None if denoised else pictures,
         guides=guides,
         sources=sources,
-        confidence=confidence,
+        confidence=trusted.confidence,
         modulation=modulation,
         clean_albedo=clean,
         geometric_confidence=warped.confidence if guided else None,
         rendered_variance=centre.variance,
-        first_pass=estimates,
+        first_pass=pictures if denoised else None,
         centre_first_pass=None if window.first_pass is None else window.first_pass[middle],
         aovs={name.removeprefix("aov "): layer for name, layer in warped.layers.items() if name.startswith("aov ")},
         repaired=centre.repaired,
@@ -173,8 +171,7 @@ def align(
         neighbour_samples=sides,
         neighbour_trust=(warped.trust[middle - 1], warped.trust[middle + 1]) if middle else (None, None),
         known_range=found,
-        # A copy: a view would keep the weights of all frames in memory.
-        drift_weight=None if weight is None or not _shows_drift(window) else weight[middle + 1].copy(),
+        drift_weight=trusted.drift_weight,
         passes=centre.passes,
         filtered_guides=filtered,
     )
@@ -337,6 +334,51 @@ def _warp_first_pass(
     return warped
 
 
+def _trust_noisy(warped: _Warped, centre_irradiance: Array, exposure: float, stages: Collection[str]) -> _Trusted:
+    """Combine geometry with the gate by the frames' rough light, without a first pass."""
+    if "gate" not in stages:
+        return _Trusted(warped.confidence)
+    return _Trusted(warped.confidence * color_gate(warped.layers["light"], centre_irradiance, exposure))
+
+
+def _gate_denoised(
+    first_pass: Array,
+    centre_irradiance: Array,
+    confidence: Array,
+    coverage: Array,
+    exposure: float,
+    stages: Collection[str],
+) -> list[Array]:
+    """Combine geometry with the gate by first passes; with the stage "drift" also with a stricter gate."""
+    shares = (SHARE, DRIFTING_SHARE) if "drift" in stages else (SHARE,)
+    gates = color_gates(first_pass, centre_irradiance, exposure, shares)
+    return [trust_light(confidence, coverage, gate, stages) for gate in gates]
+
+
+def _trust_denoised(
+    window: Window,
+    first_pass: Array,
+    centre_irradiance: Array,
+    confidences: list[Array],
+    exposure: float,
+    first_row: int,
+) -> _Trusted:
+    """Multiply confidences of `_gate_denoised`, in place, by the agreement of all neighbours, and measure drift."""
+    stages, middle = window.stages, len(first_pass) // 2
+    confidence, *strict = confidences
+    if "gate" in stages:
+        agreement = agreement_weight(first_pass, centre_irradiance, confidence, exposure)
+        for trusted in confidences:
+            trusted[:middle] *= agreement
+            trusted[middle + 1 :] *= agreement
+    if "drift" not in stages:
+        return _Trusted(confidence)
+    weight = drift_weights(first_pass, centre_irradiance, confidence, exposure, first_row=first_row)
+    pull = _stricter_where_light_drifts(weight, confidence, *strict)
+    # A copy: a view would keep the weights of all frames in memory.
+    return _Trusted(confidence, pull, weight[middle + 1].copy() if _shows_drift(window) else None)
+
+
 def _stricter_where_light_drifts(weight: Array, confidence: Array, strict: Array) -> Array:
     """Multiply weights by drift by how much less a strict gate trusts a frame, where light drifts; reuses `strict`."""
     drifting = 1 - _smooth_step(weight[min(len(weight) // 2 + 1, len(weight) - 1)], *DRIFTING)
@@ -346,6 +388,23 @@ def _stricter_where_light_drifts(weight: Array, confidence: Array, strict: Array
     strict += 1
     strict *= weight
     return strict
+
+
+def _average_samples(
+    sources: WarpSources,
+    pictures: Array,
+    geometry: Array,
+    trusted: _Trusted,
+    modulation: Array,
+    centre: PreparedFrame,
+    found: SampleRange | None,
+) -> SampleMean:
+    """Average the neighbours' samples; pull first passes to the centre's, and add them with the samples to `found`."""
+    residuals = None
+    if sources.first_pass:
+        residuals = _pull_behind(sources.residual_strips(), pictures, trusted.confidence, trusted.pull, found)
+    noisy = centre.radiance[sources.rows]
+    return average_neighbours(pictures, residuals, trusted.confidence, geometry, modulation, noisy)
 
 
 def _pull_behind(
@@ -367,22 +426,24 @@ def _pull_behind(
             found.add(estimates, strip, top)
 
 
-def _fill_centre(
-    warped: _Warped, own: Array, estimates: Array | None, sources: WarpSources
-) -> tuple[Array | None, Array]:
-    """Fill pixels of the centre without a finite color from the neighbours in time; the colors and the centre's."""
-    color, middle = warped.layers.pop("color", None), len(warped.confidence) // 2
+def _fill_centre(warped: _Warped, pictures: Array, centre_irradiance: Array, sources: WarpSources) -> Array:
+    """Fill pixels of the centre without a finite color from the neighbours in time; return its irradiance.
+
+    `pictures` are first passes where `sources` has these, else the colors.
+    """
+    denoised, middle = bool(sources.first_pass), len(pictures) // 2
     gone = warped.confidence[middle] == 0
     if gone.any():
         # The neighbours in space fill a single pixel well, a block badly: those in time come first.
-        own = own.copy()
-        own[gone] = average(sources.warp("irradiance", own) if color is None else color, warped.confidence)[gone]
-        pictures = [layer for name, layer in warped.layers.items() if name == "light" or name.startswith("aov ")]
-        for layer in (*pictures, *([] if estimates is None else [estimates])):
+        centre_irradiance = centre_irradiance.copy()
+        centre_irradiance[gone] = average(
+            sources.warp("irradiance", centre_irradiance) if denoised else pictures, warped.confidence
+        )[gone]
+        for layer in (*warped.layers.values(), *([pictures] if denoised else [])):
             layer[middle][gone] = average(layer, warped.confidence)[gone]
-    if color is not None:
-        color[middle] = own
-    return color, own
+    if not denoised:
+        pictures[middle] = centre_irradiance
+    return centre_irradiance
 
 
 def _shows_drift(window: Window) -> bool:
