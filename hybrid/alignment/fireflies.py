@@ -1,7 +1,7 @@
 """Remove single bright samples from a frame; those that neighbouring frames show as well are highlights, and stay."""
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
@@ -18,6 +18,7 @@ from hybrid.alignment.measure import (
     scaled,
 )
 from hybrid.alignment.prepare import PreparedFrame, rendered_flow
+from hybrid.files.frame import Array
 from hybrid.runtime.timing import Timings
 from loops.parallel import Mask, Places
 from nlm.fireflies import (
@@ -37,6 +38,32 @@ from nlm.fireflies import (
 
 # A highlight of a pixel has to be in so many frames beside its own, at most so many frames away.
 WITNESSES, REACH = 2, 2
+
+
+@dataclass
+class _Witnesses:
+    """Frames beside this one that were tested for each of K bright places, and those that show the same highlight."""
+
+    tested: Places  # (K,): how many frames with noise of their own
+    showing: Places  # (K,): how many of these show the highlight
+    # lights of each frame, the motion there, and which (K,) are the same highlight
+    found: list[tuple[Highlights, Points, Mask]] = field(default_factory=list)
+
+    @property
+    def undecided(self) -> Mask:
+        """Places (K,) that all tested frames show, but too few were tested."""
+        return np.asarray((self.showing == self.tested) & (self.tested < WITNESSES))
+
+    @property
+    def lasting(self) -> Mask:
+        """Places (K,) that all tested frames show."""
+        return np.asarray((self.tested > 0) & (self.showing == self.tested))
+
+    def add(self, lights: Highlights, moved: Points, tested: Mask, same: Mask) -> None:
+        """Count a frame at the places (K,) where it was tested, and where it shows the same highlight."""
+        self.tested += tested
+        self.showing += same
+        self.found.append((lights, moved, same))
 
 
 def remove_fireflies(
@@ -73,52 +100,70 @@ def _find_highlights(
     """
     rough = measure_highlights(frame.irradiance, places)
     centre = measure_highlights(frame.irradiance, nearest_pixel(rough.points), frame.divisor_at)
-    asked, shown = np.zeros(len(places), int), np.zeros(len(places), int)
+    witnesses = _Witnesses(np.zeros(len(places), int), np.zeros(len(places), int))
     alone = np.ones(len(places), bool)
     still = np.zeros_like(centre.points)
-    moved, last = {-1: still, 1: still}, {-1: frame, 1: frame}
-    found: list[tuple[Highlights, Points, Mask]] = []
-    compared, equal = [(frame, still)], SAME
+    moved = {-1: still, 1: still}
+    last: dict[int, PreparedFrame | None] = {-1: frame, 1: frame}
+    compared, equal = [(frame.irradiance, still)], SAME
     for distance, side in product(range(1, REACH + 1), (-1, 1)):
-        undecided = (shown == asked) & (asked < WITNESSES)
-        if side not in moved or not (distance == 1 or undecided.any()):
+        here, undecided = last[side], witnesses.undecided
+        if here is None or not (distance == 1 or undecided.any()):
             continue
-        there = neighbour(distance * side)
-        if there is None:
-            del moved[side]
+        there = last[side] = neighbour(distance * side)
+        if there is None:  # no motion leads to the frames behind it
             continue
         with timings.stage("prepare"):
-            moved[side] = moved[side] + _motion(last[side], there, nearest_pixel(centre.points + moved[side]))
-            last[side] = there
+            motion = moved[side] = moved[side] + _motion(here, there, nearest_pixel(centre.points + moved[side]))
             fade = measure_fade(there.irradiance, frame.irradiance, frame.valid & there.valid)
             if (fade != 1).any():
                 there, equal = scaled(there, fade), NEAR
-            pixels = follow_motion(centre, moved[side])
-            lights = measure_highlights(there.irradiance, pixels, there.divisor_at)
-            # A lamp fades with the picture or stays as it is.
-            off, unlit = (np.abs(light - centre.light).sum(axis=1) for light in (lights.light, lights.light / fade))
-            lights = replace(lights, light=np.where((unlit < off)[:, None], lights.light / fade, lights.light))
-            fresh = np.isfinite(lights.light).all(axis=1)
-            for other, before in compared:
-                fresh &= not repeats(other.irradiance, there.irradiance, equal)
-                unmoved = np.abs(moved[side] - before).max(axis=1) < MOVED_NOISE
-                if unmoved.any():
-                    noise = equal_noise(other.irradiance, there.irradiance, equal)
-                    fresh = fresh & ~(unmoved & same_noise_at(*noise, pixels))
-            equal_frames = ~fresh & np.isfinite(lights.light).all(axis=1)
-            if equal_frames.any():  # without noise they are no sample shown twice
-                free = np.zeros(len(places), bool)
-                free[equal_frames] = noise_free_around(frame, places[equal_frames])
-                fresh = fresh | free
+            lights = _lights_of(there, follow_motion(centre, motion), centre, fade)
+            fresh = _has_own_noise(frame, places, there.irradiance, lights, motion, compared, equal)
             if distance == 1:
-                alone &= ~(fresh & recurs_nearby(places, frame.irradiance, pixels, there.irradiance))
-            same = fresh & undecided & same_highlight(centre, moved[side], lights)
-            same[same] = without_strangers(centre[same], frame.irradiance, pixels[same], there.irradiance)
-        asked, shown = asked + (fresh & undecided), shown + same
-        found.append((lights, moved[side], same))
-        compared.append((there, moved[side]))
-    lasting = (asked > 0) & (shown == asked)
-    return average_highlights(centre, found)[lasting], alone & ~lasting
+                alone &= ~(fresh & recurs_nearby(places, frame.irradiance, lights.pixels, there.irradiance))
+            tested = fresh & undecided
+            same = tested & same_highlight(centre, motion, lights)
+            same[same] = without_strangers(centre[same], frame.irradiance, lights.pixels[same], there.irradiance)
+        witnesses.add(lights, motion, tested, same)
+        compared.append((there.irradiance, motion))
+    lasting = witnesses.lasting
+    return average_highlights(centre, witnesses.found)[lasting], alone & ~lasting
+
+
+def _lights_of(there: PreparedFrame, pixels: Places, centre: Highlights, fade: Array) -> Highlights:
+    """Measure highlights at pixels of a frame in the light of the centre, which is `fade` times its own."""
+    lights = measure_highlights(there.irradiance, pixels, there.divisor_at)
+    # A lamp fades with the picture or stays as it is.
+    unfaded = lights.light / fade
+    off, off_unfaded = (np.abs(light - centre.light).sum(axis=1) for light in (lights.light, unfaded))
+    return replace(lights, light=np.where((off_unfaded < off)[:, None], unfaded, lights.light))
+
+
+def _has_own_noise(
+    frame: PreparedFrame,
+    places: Places,
+    there: Array,
+    lights: Highlights,
+    motion: Points,
+    compared: Sequence[tuple[Array, Points]],
+    equal: float,
+) -> Mask:
+    """Return which places (K,) another frame `there` shows with samples that no frame of `compared` has.
+
+    `compared` are irradiances with the motion there; samples are the same up to a share `equal` of their value.
+    """
+    inside = np.isfinite(lights.light).all(axis=1)
+    repeated = np.zeros(len(places), bool)
+    for other, before in compared:
+        repeated |= repeats(other, there, equal)
+        unmoved = np.abs(motion - before).max(axis=1) < MOVED_NOISE
+        if unmoved.any():
+            repeated |= unmoved & same_noise_at(*equal_noise(other, there, equal), lights.pixels)
+    repeated &= inside
+    if repeated.any():  # without noise they are no sample shown twice
+        repeated[repeated] = ~noise_free_around(frame, places[repeated])
+    return inside & ~repeated
 
 
 def _motion(here: PreparedFrame, there: PreparedFrame, pixels: Places) -> Points:
