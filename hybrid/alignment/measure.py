@@ -66,6 +66,12 @@ TILE = 32
 # optical flow leaves more than this share of the change. A change of light does as much, but leaves the guides as they
 # are: along the vectors 0.04 to 0.36 of them changed, at a cut 0.7 to 0.96.
 CUT = 0.5
+# Rows and columns of areas over the lit part: their medians average noise.
+AREAS = 4, 6
+# Greatest share of the changes that a factor of the whole picture leaves in three quarters of the areas, and that of a
+# slight one: on rendered shots of 8 to 512 samples 0.59 to 1.2 are left where light moves, and of fades by 0.7 less
+# than 0.5 in 73 of 80. Factors of three channels are chosen where they leave less than LEFT of what one factor leaves.
+LEFT, LEFT_SLIGHT = 0.5, 0.25
 # Logarithm of a fade that is slight: under one of 1.5 % that left 0.4 of the changes, a textured object in other light
 # lost 1.5 dB where the noise is 1 %.
 SLIGHT = 0.1
@@ -404,36 +410,51 @@ def _fade(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | Non
 def _factors(first: Array, second: Array, known: Mask, noise: Array | None = None) -> Doubles:
     """Median (C,) of the second of two images (H, W, C) over the first, where `known`; 1 where that explains little.
 
-    Changes are medians of logarithms in 4×6 areas of the lit part, which average noise. A factor that leaves less than
-    half of them, or a quarter of slight ones, in three quarters of the areas is one of the whole picture: on rendered
-    shots of 8 to 512 samples 0.59 to 1.2 are left where light moves, and of fades by 0.7 less than half in 73 of 80. So
-    is a factor beyond its error, where the `noise` (H, W, C) of the first image explains what it leaves. One factor
-    serves for all channels unless those of three channels leave less than half.
+    Changes are medians of logarithms in areas of the lit part. Factors explain the changes if they leave little of
+    them, or are beyond their errors and the `noise` (H, W, C) of the first image explains what they leave.
     """
     mean = channel_mean(first)
     lit = known & (np.minimum(mean, channel_mean(second)) > NO_LIGHT)
     if not lit.any():
         return np.ones(first.shape[2])
+    cells = _lit_cells(lit)
+    changes, factors = _choose_factors(first, second, mean, lit, cells)
+    left, size = _upper_quartile(changes - factors), float(np.abs(factors).max())
+    explains = left < (LEFT_SLIGHT if size < SLIGHT else LEFT) * _upper_quartile(changes)
+    if not explains and noise is not None and size > max(LEAST_FADE, KNOWN * left / np.sqrt(len(changes))):
+        noise, light = (noise, first) if len(factors) == 3 else (channel_mean(noise)[..., None], mean[..., None])
+        explains = left < EXPLAINED * _median_error(noise, light, lit, cells)
+    found = len(changes) >= LEAST_AREAS and explains
+    return np.broadcast_to(np.exp(factors) if found else np.ones(1), first.shape[2])
+
+
+def _lit_cells(lit: Mask) -> list[tuple[Places, ...]]:
+    """Divide the lit part of an image into areas; return the indices of those with any lit pixel."""
     rows, columns = (np.arange(*np.flatnonzero(lit.any(axis=axis))[[0, -1]] + (0, 1)) for axis in (1, 0))
-    cells = [np.ix_(y, x) for y in np.array_split(rows, 4) for x in np.array_split(columns, 6)]
-    cells = [cell for cell in cells if lit[cell].any()]
+    cells = [np.ix_(y, x) for y in np.array_split(rows, AREAS[0]) for x in np.array_split(columns, AREAS[1])]
+    return [cell for cell in cells if lit[cell].any()]
+
+
+def _choose_factors(
+    first: Array, second: Array, mean: Array, lit: Mask, cells: Sequence[tuple[Places, ...]]
+) -> tuple[Doubles, Doubles]:
+    """Logarithms of changes in N areas, (N, 1) or (N, 3), and of one factor for all channels, or of one for each."""
     gray = _changes(mean, channel_mean(second), lit, cells)
-    areas, factors = gray[:, None], np.array([np.median(gray)])
+    factor = np.array([np.median(gray)])
     if first.shape[2] == 3 and _is_tinted(first, second, lit):
         tinted = np.stack([_changes(first[..., c], second[..., c], lit, cells, gray) for c in range(3)], axis=1)
-        if 2 * _upper_quartile(tinted - np.median(tinted, axis=0)) < _upper_quartile(tinted - factors):
-            areas, factors = tinted, np.median(tinted, axis=0)
-    left, change = _upper_quartile(areas - factors), _upper_quartile(areas)
-    size = float(np.abs(factors).max())
-    explains = left < (0.25 if size < SLIGHT else 0.5) * change
-    if not explains and noise is not None and size > max(LEAST_FADE, KNOWN * left / np.sqrt(len(areas))):
-        noise, light = (noise, first) if len(factors) == 3 else (channel_mean(noise)[..., None], mean[..., None])
-        relative = np.abs(noise) / np.maximum(light, np.float32(NO_LIGHT))
-        squares = np.square(np.minimum(relative, np.float32(FIREFLY))).mean(axis=2)
-        errors = [np.sqrt(2 * np.mean(squares[cell][lit[cell]]) / np.count_nonzero(lit[cell])) for cell in cells]
-        explains = left < EXPLAINED * np.median(errors)
-    found = len(areas) >= LEAST_AREAS and explains
-    return np.broadcast_to(np.exp(factors) if found else np.ones(1), first.shape[2])
+        factors = np.median(tinted, axis=0)
+        if _upper_quartile(tinted - factors) < LEFT * _upper_quartile(tinted - factor):
+            return tinted, factors
+    return gray[:, None], factor
+
+
+def _median_error(noise: Array, light: Array, lit: Mask, cells: Sequence[tuple[Places, ...]]) -> float:
+    """Median over areas of the standard error of a change by noise (H, W, C) of this light."""
+    relative = np.abs(noise) / np.maximum(light, np.float32(NO_LIGHT))
+    squares = np.square(np.minimum(relative, np.float32(FIREFLY))).mean(axis=2)
+    errors = [np.sqrt(2 * np.mean(squares[cell][lit[cell]]) / np.count_nonzero(lit[cell])) for cell in cells]
+    return float(np.median(errors))
 
 
 def _is_tinted(first: Array, second: Array, lit: Mask) -> bool:
