@@ -87,7 +87,7 @@ def expand(compressed: Array, exposure: float) -> Array:
 def measure_exposure(*images: Array) -> float:
     """Return the mean radiance of the lit part of an image (H, W, C), with its brightest hundredth clipped.
 
-    Of several images the first with light counts: figures of a black frame and a lit one must not depend on the unit.
+    The first of several images that has light counts: figures of a black frame and a lit one must not depend on the unit.
     Positive, and proportional to the image; 1 without an image of more light than `NO_LIGHT`. Non-finite values are
     excluded. The image is divided into bins of at most 16×16 pixels. A bin is lit where its mean exceeds `LIT` times
     the result, so that an object on black has the exposure of the object alone. Single pixels do not show whether a

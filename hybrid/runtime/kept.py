@@ -65,7 +65,7 @@ class Keeper:
         """Release pages and, with `trims`, return freed memory: before each stage that takes much of it.
 
         At the end of a stage half of the process's memory is free, in pieces that blocks of the next may not fit in.
-        `fast` at 1920×1080 takes 1.2 times the CPU time with it, and 1.5 times where glibc returns all blocks of more
+        `fast` at 1920×1080 takes 1.1 times the CPU time with it, and 1.5 times where glibc returns all blocks of more
         than 4 MiB as they are freed.
         """
         self.release()
