@@ -18,8 +18,9 @@ NO_LIGHT = 1e-30
 # Share of an image's exposure below which a part is not lit. Denoisers leave 1e-10 to 1e-4 on black next to an object;
 # the darkest hundredth of a lit picture hardly changes its mean.
 LIT = 1e-2
-# The same for OIDN's curve: a room beside a window of 750 times its light still counts, which the networks otherwise
-# see as black and leave 1 to 4 dB worse than their first pass. With 1e-4 the rim of a cut-out object loses 0.5 dB.
+# The same for OIDN's curve: where a window makes the exposure 750 times that of the room, the room still counts. The
+# networks otherwise see it as black, 1 to 4 dB worse than their first pass in place of 3 to 7 dB better. With 1e-4 the
+# rim of a cut-out object loses 0.5 dB.
 DIM = 1e-3
 # Share of an image's exposure that OIDN's measure leaves out as black. OIDN leaves out 1e-8 whatever the unit.
 BLACK = 1e-8
@@ -87,7 +88,7 @@ def expand(compressed: Array, exposure: float) -> Array:
 def measure_exposure(*images: Array) -> float:
     """Return the mean radiance of the lit part of an image (H, W, C), with its brightest hundredth clipped.
 
-    The first of several images that has light counts: figures of a black frame and a lit one must not depend on the unit.
+    The first of several images with light counts: what compares a black and a lit frame must not depend on the unit.
     Positive, and proportional to the image; 1 without an image of more light than `NO_LIGHT`. Non-finite values are
     excluded. The image is divided into bins of at most 16×16 pixels. A bin is lit where its mean exceeds `LIT` times
     the result, so that an object on black has the exposure of the object alone. Single pixels do not show whether a
