@@ -170,7 +170,7 @@ class ExrImage:
         groups: dict[tuple[str, int], list[str]] = {}
         for qualified, (part, _) in self._origin.items():
             groups.setdefault((qualified.rpartition(".")[0], part), []).append(qualified)
-        return tuple(
+        found = [
             Layer(
                 name,
                 part,
@@ -178,7 +178,12 @@ class ExrImage:
                 tuple(sorted(channels, key=_component_order)),
             )
             for (name, part), channels in groups.items()
-        )
+        ]
+        # Names of the default view may leave it out: R beside right.R, albedo.R beside albedo.right.R. Then all do.
+        left_out = {"", *(without_view(layer) for layer in found if layer.view)}
+        if self.views and any(layer.view is None and layer.name in left_out for layer in found):
+            found = [replace(layer, view=layer.view or self.views[0]) for layer in found]
+        return tuple(found)
 
     @property
     def channel_names(self) -> tuple[str, ...]:

@@ -217,7 +217,10 @@ def _fit_file(image: ExrImage, role: str, layer: Layer) -> Layer | None:
 
 
 def find_colors(image: ExrImage, profile: Profile) -> list[Layer]:
-    """Find the color of each stereo view and view layer; ExrError if several could be the color of one of them."""
+    """Find the color of each stereo view and view layer; ExrError if several could be the color of one of them.
+
+    A color that several stereo views share is one picture.
+    """
     colors = []
     for view in image.views or (None,):
         named = _name_colors(image, profile, view, []) or _name_grays(image, profile, view)
@@ -225,7 +228,7 @@ def find_colors(image: ExrImage, profile: Profile) -> list[Layer]:
         # Layers of no view layer beside those of one are no view of their own, but ambiguous.
         split = [named] if "" in groups else [[x for x in named if _group(x) == group] for group in sorted(groups)]
         colors += [_only(image, "color", layers) for layers in split if layers]
-    return colors
+    return list(dict.fromkeys(colors))
 
 
 def _name_colors(image: ExrImage, profile: Profile, view: str | None, notes: list[str]) -> list[Layer]:
@@ -233,7 +236,7 @@ def _name_colors(image: ExrImage, profile: Profile, view: str | None, notes: lis
     visible = [layer for layer in image.layers if layer.view in (None, view)]
     for names in (profile.own_names("color"), profile.names("color")):
         # Bare channels are a file's, not those of any of its parts.
-        named = [x for x in visible if ({*_tails(image, x)} - {""} if x.name else {""}) & {*names}]
+        named = [x for x in visible if ({*_tails(image, x)} - {""} if without_view(x) else {""}) & {*names}]
         fitting = {layer: fitted for layer in named if (fitted := _fit(image, "color", layer, named=True))}
         if not fitting:
             continue
@@ -257,10 +260,10 @@ def _find_guide(image: ExrImage, role: str, color: Layer, profile: Profile) -> L
     layers: list[tuple[set[str], Layer]] = []
     for layer in _same_group(image, color):
         # Bare channels are those beside the color's: those of other parts can be anything.
-        bare = not layer.name or (layer.part == color.part and "" in _paths(image, layer))
+        bare = not without_view(layer) or (layer.part == color.part and "" in _paths(image, layer))
         layers.append(({*_tails(image, layer)} - {""} | ({""} if bare else set()), layer))
-        if not layer.name:  # a single bare channel may have a name too: depth, a
-            layers += [({plain_name(c)}, Layer("", layer.part, layer.view, (c,))) for c in layer.channels]
+        if not without_view(layer):  # a single bare channel may have a name too: depth, a
+            layers += [({plain_name(c.rpartition(".")[2])}, replace(layer, channels=(c,))) for c in layer.channels]
     near = [(tails, layer) for tails, layer in layers if _group(layer) == _group(color)]
     for name in profile.names(role):
         for scope in (near, layers):

@@ -145,7 +145,8 @@ class Shot:
     def views(self) -> tuple[Self, ...]:
         """This shot once for each view layer and stereo view of its files; itself if the color was chosen.
 
-        Raises ExrError if there are several, and sidecars: which view these belong to is unknown.
+        Raises ExrError if there are several, and sidecars, as which view these belong to is unknown, or a layer that
+        two of them would write.
         """
         reader = self.reader
         if "color" in reader.files.layers:
@@ -157,7 +158,16 @@ class Shot:
         if reader.files.sidecars:
             names = ", ".join(map(str, colors))
             raise ExrError(f"{image.path}: {names}, and layers in other files: expected one (--layer color=NAME)")
-        return tuple(self._with_color(color) for color in colors)
+        views = tuple(self._with_color(color) for color in colors)
+        written: set[str] = set()
+        for view in views:
+            layers = view.layers(reader.files.first)
+            own = {c for x in (layers.target, layers.alpha, *layers.aovs.values()) if x is not None for c in x.channels}
+            if twice := sorted(own & written):
+                names = ", ".join(map(str, colors))
+                raise ExrError(f"{image.path}: {names} would all write {twice[0]}, expected one (--layer color=NAME)")
+            written |= own
+        return views
 
     def _with_color(self, color: Layer) -> Self:
         reader = self.reader

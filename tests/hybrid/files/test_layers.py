@@ -186,6 +186,34 @@ def test_stereo_takes_the_default_view_and_overrides_any(tmp_path):
         assert layers.albedo.channels[0] == "ViewLayer.Albedo.left.R"
 
 
+@pytest.mark.parametrize("kept", ["", ".left"])
+def test_names_of_the_default_view_may_leave_it_out(tmp_path, kept):
+    """The standard leaves it out of R, G, B; Nuke of every layer."""
+    names = [f"{x}{view}.{c}" for x in ("albedo", "diffuse") for view in (kept, ".right") for c in "RGB"]
+    names += [*"RGBAZ", *(f"right.{c}" for c in "RGBA"), "mist.Z"]
+    path = save(tmp_path / "a.exr", planes(names), multiView=["left", "right"])
+    left, right = (view.layers(1) for view in open_shot(path, aovs=["all"]).views)
+    assert (left.view, str(left.color), str(left.alpha), str(left.depth)) == ("left", "RGB", "A", "Z")
+    assert (str(left.albedo), str(left.aovs["diffuse"])) == (f"albedo{kept}.RGB", f"diffuse{kept}.RGB")
+    assert (right.view, str(right.color), str(right.alpha), right.depth) == ("right", "right.RGB", "right.A", None)
+    assert (str(right.albedo), str(right.aovs["diffuse"])) == ("albedo.right.RGB", "diffuse.right.RGB")
+
+
+def test_a_color_that_both_views_share_is_one_picture(tmp_path):
+    """It was denoised twice, into the same channels."""
+    names = [f"{x}.{c}" for x in ("color", "albedo.left", "albedo.right") for c in "RGB"]
+    (one,) = open_shot(save(tmp_path / "a.exr", planes(names), multiView=["left", "right"])).views
+    assert str(one.layers(1).albedo) == "albedo.left.RGB"
+
+
+def test_a_layer_that_two_views_would_write_is_refused(tmp_path):
+    names = [f"{view}.{x}.{c}" for view in ("Front", "Back") for x in ("Combined", "Albedo") for c in "RGB"]
+    path = save(tmp_path / "a.exr", planes([*names, "key.R", "key.G", "key.B"]))
+    with pytest.raises(ExrError, match=r"Back\.Combined\.RGB, Front\.Combined\.RGB would all write key\.B, expected"):
+        _ = open_shot(path, aovs=["key"]).views
+    assert len(open_shot(path, layers={"color": "Front.Combined"}, aovs=["key"]).views) == 1
+
+
 def test_overrides_win_and_say_what_there_is(tmp_path):
     names = [*"RGBA", "RGBA_key.R", "RGBA_key.G", "RGBA_key.B", "m.u", "m.v", "P.X", "P.Y", "P.Z"]
     image = read_exr(save(tmp_path / "a.exr", planes(names)), pixels=False)
