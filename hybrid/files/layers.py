@@ -123,8 +123,10 @@ def find_layers(
         raise ValueError(f"layer role {sorted(unknown)[0]!r} is unknown, expected one of {', '.join(ROLES)}")
     profile = profile or find_profile(image)
     notes: list[str] = []
-    found: dict[str, Layer | None] = {**(sidecars or {}), **_fit_overrides(image, overrides)}
-    color = found["color"] = found.get("color") or _find_any_color(image, profile, notes)
+    named = overrides.get("color")
+    color = _find_any_color(image, profile, notes) if named is None else _fit_override(image, "color", named, None)
+    found: dict[str, Layer | None] = {**(sidecars or {}), "color": color}
+    found |= {role: _fit_override(image, role, x, color.view) for role, x in overrides.items() if role != "color"}
     for role in ROLES[1:]:
         if role not in found:
             found[role] = _find_guide(image, role, color, profile)
@@ -167,15 +169,25 @@ def find_layers(
     )
 
 
-def _fit_overrides(image: ExrImage, overrides: Mapping[str, str | Layer]) -> dict[str, Layer]:
-    """The layers that the user names, with the channels of their roles."""
-    found = {}
-    for role, name in overrides.items():
-        layer = image.layer(name) if isinstance(name, str) else image.again(name)
-        fitted = _fit(image, role, layer, named=True) or (_as_gray(layer) if role == "color" else None)
-        if fitted is None:
-            raise ExrError(f"{image.path}: layer {layer} cannot be used as {role}: {ROLE_FACTS[role]['needs']}")
-        found[role] = fitted
+def _fit_override(image: ExrImage, role: str, named: str | Layer, view: str | None) -> Layer:
+    """The layer that the user names, of the color's view, with the channels of its role."""
+    layer = _find_named(image, named, view) if isinstance(named, str) else image.again(named)
+    fitted = _fit(image, role, layer, named=True) or (_as_gray(layer) if role == "color" else None)
+    if fitted is None:
+        raise ExrError(f"{image.path}: layer {layer} cannot be used as {role}: {ROLE_FACTS[role]['needs']}")
+    return fitted
+
+
+def _find_named(image: ExrImage, name: str, view: str | None) -> Layer:
+    """The layer of this name; that of the color's view where it is another's and the name does not say so."""
+    found = image.layer(name)
+    if view is None or found.view in (None, view) or found.view in name.split("."):
+        return found
+    whole = next(layer for layer in image.layers if {*found.channels} <= {*layer.channels})
+    ends = {component_of(channel) for channel in found.channels}
+    for layer in image.layers:
+        if layer.view == view and without_view(layer) == without_view(whole):
+            return replace(layer, channels=tuple(c for c in layer.channels if component_of(c) in ends))
     return found
 
 
@@ -336,7 +348,7 @@ def _find_aovs(
     if ALL in names and not found:
         raise ExrError(f"{image.path}: aov all: no layer has a name for a part of the light; {image.listing()}")
     for name in [*found, *(name for name in names if name != ALL)]:
-        layer = found.get(name) or image.layer(name)
+        layer = found.get(name) or _find_named(image, name, color.view)
         if name in ("color", "alpha"):
             raise ExrError(f"{image.path}: aov {name!r} is also a role, expected the whole name: {layer}")
         if clash := next((used[channel] for channel in layer.channels if channel in used), None):

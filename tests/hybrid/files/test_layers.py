@@ -206,6 +206,23 @@ def test_a_color_that_both_views_share_is_one_picture(tmp_path):
     assert str(one.layers(1).albedo) == "albedo.left.RGB"
 
 
+@pytest.mark.parametrize("left", ["", ".left"])
+def test_named_layers_are_those_of_each_view(tmp_path, left):
+    """The right eye had the guides of the left one, and wrote its own light passes over that one's."""
+    names = [f"{x}{view}.{c}" for x in ("beauty", "mine", "key") for view in (left, ".right") for c in "RGB"]
+    names += [f"far{view}.{c}" for view in (left, ".right") for c in "XZ"]
+    path = save(tmp_path / "a.exr", planes(names), multiView=["left", "right"])
+    layers = {"albedo": "mine", "depth": "far.Z" if not left else "far"}
+    for view, end in zip(open_shot(path, layers=layers, aovs=["key"]).views, (left, ".right"), strict=True):
+        found = view.layers(1)
+        assert str(found.color) == f"beauty{end}.RGB"
+        assert str(found.albedo) == f"mine{end}.RGB"
+        assert found.depth.channels == (f"far{end}.Z",)
+        assert str(found.aovs["key"]) == f"key{end}.RGB"
+    for view in open_shot(path, layers={"albedo": "mine.right"}).views:
+        assert str(view.layers(1).albedo) == "mine.right.RGB"
+
+
 def test_a_layer_that_two_views_would_write_is_refused(tmp_path):
     names = [f"{view}.{x}.{c}" for view in ("Front", "Back") for x in ("Combined", "Albedo") for c in "RGB"]
     path = save(tmp_path / "a.exr", planes([*names, "key.R", "key.G", "key.B"]))
