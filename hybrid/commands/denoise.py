@@ -103,22 +103,32 @@ def denoise(
     pictures = {"preview": preview, "contact-sheet": contact_sheet, "breakdown": options.breakdown}
     folders = {"output": output, "keep-first-pass": options.keep_first_pass}
     shots.expect_views_apart(views, read, folders, {"first-pass": sequence, **pictures})
+    failed = False
     for view in views:
         if view:
             LOG.info(f"view {view}")
         here = shots.in_view(request, view)
-        if scheduler is not None:
-            # A chunk that is run again, after its worker died, skips the frames that are finished.
-            _denoise_in_chunks(
-                context, here, view, lambda _: chunk, {"resume": True}, partial(run_on_cluster, scheduler)
-            )
-        elif jobs > 1:
-            # Chunks as long as possible: each computes its neighbours as well.
-            limit = options.max_memory and f"{parse_size(options.max_memory) // jobs / 2**20:.3f}M"
-            changes = {"max_memory": limit, "jobs": None}
-            _denoise_in_chunks(context, here, view, lambda count: -(-count // jobs), changes, partial(run_jobs, jobs))
-        else:
-            _denoise(here)
+        try:
+            if scheduler is not None:
+                # A chunk that is run again, after its worker died, skips the frames that are finished.
+                _denoise_in_chunks(
+                    context, here, view, lambda _: chunk, {"resume": True}, partial(run_on_cluster, scheduler)
+                )
+            elif jobs > 1:
+                # Chunks as long as possible: each computes its neighbours as well.
+                limit = options.max_memory and f"{parse_size(options.max_memory) // jobs / 2**20:.3f}M"
+                changes = {"max_memory": limit, "jobs": None}
+                _denoise_in_chunks(
+                    context, here, view, lambda count: -(-count // jobs), changes, partial(run_jobs, jobs)
+                )
+            else:
+                _denoise(here)
+        except typer.Exit as end:
+            if not options.keep_going or end.exit_code == INTERRUPTED:
+                raise
+            failed = True
+    if failed:
+        raise typer.Exit(1)
 
 
 def _denoise_in_chunks(

@@ -226,6 +226,19 @@ def test_a_file_for_each_eye(pattern: str, letter: bool, mono: dict[str, bytes],
         assert color(tmp_path / f"out_{eye[0] if letter else eye}", "ViewLayer.Combined") == expected
 
 
+def test_a_frame_of_one_eye_that_cannot_be_made_leaves_the_other_eye_to_be_made(tmp_path: Path) -> None:
+    """With --keep-going the second eye was not made, without a word."""
+    for truth in FRAMES:
+        for eye in ("left", "right"):
+            save(tmp_path / eye / f"shot.{truth.number:04d}.exr", view(truth))
+    damaged = tmp_path / "left" / f"shot.{FRAMES[-1].number:04d}.exr"
+    damaged.write_bytes(damaged.read_bytes()[:-2000])
+    words = ["denoise", str(tmp_path / "%V"), "-o", str(tmp_path / "out_%V"), "--preset", "draft"]
+    assert main([*words, "--keep-going"]) == 1
+    assert len(list((tmp_path / "out_right").glob("*.exr"))) == len(FRAMES)
+    assert len(list((tmp_path / "out_left").glob("*.exr"))) < len(FRAMES)
+
+
 def test_two_eyes_do_not_go_into_one_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for eye in ("left", "right"):
         save(tmp_path / eye / "shot.0001.exr", view(FRAMES[0]))
