@@ -4,9 +4,9 @@ import os
 import shlex
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -30,7 +30,7 @@ from hybrid.memory import parse_size
 from hybrid.pipeline import Failed, Finished
 from hybrid.plan import NEURAL_STAGES, Plan, merge
 from hybrid.preview import check_png, check_preview, write_contact_sheet, write_preview
-from hybrid.records import Record, sequence_name
+from hybrid.records import Record, read_records, sequence_name
 from hybrid.runtime.interrupt import INTERRUPTED, interruptible
 from hybrid.runtime.system import peak_memory
 from hybrid.runtime.timing import Timings
@@ -148,11 +148,27 @@ def _denoise_in_chunks(
         name = format_frames(part)
         words = arguments_of(context, {**changes, "frames": name})
         chunks[name] = Chunk(shots.in_view(words, view), len(part))
-    run(str(context.info_name), chunks)
+    failed = None
+    try:
+        run(str(context.info_name), chunks)
+    except typer.Exit as end:
+        if not request.options.keep_going or end.exit_code == INTERRUPTED:
+            raise
+        failed = end
+    first = output_path(request.output, shot, shot.numbers[0])
+    _write_pictures(request, shot.views[0], _made(first) if failed else shot.numbers)
     if shot.missing:
         LOG.error(f"frames {format_frames(shot.missing)} were asked for and are not there")
         raise typer.Exit(1)
-    _write_pictures(request, shot.views[0])
+    if failed:
+        raise failed
+
+
+def _made(first: Path) -> list[int]:
+    """The frames of a sequence that are finished by their last records."""
+    documents = [document for _, document in read_records(first.parent, sequence_name(first))]
+    states = {int(n): entry["state"] for document in documents for n, entry in document["frames"].items()}
+    return [number for number, state in states.items() if state != "failed"]
 
 
 def _denoise(request: Request) -> None:
@@ -197,11 +213,11 @@ def _denoise(request: Request) -> None:
     if there := record.numbers("there"):
         summarize("Note", f"{len(there)} of {len(shot)} frames were finished already")
     _summarize_result(request, record, time.monotonic() - start)
+    _write_pictures(request, job.views[0], record.numbers("made", "there"))
+    _print_weights(job)
     if failed := record.numbers("failed"):
         LOG.error(f"{len(failed)} frames could not be made: {format_frames(failed)}")
         raise typer.Exit(1)
-    _write_pictures(request, job.views[0])
-    _print_weights(job)
 
 
 @contextmanager
@@ -364,10 +380,12 @@ def _print_weights(job: Job) -> None:
     LOG.info(f"wrote {job.options.breakdown}")
 
 
-def _write_pictures(request: Request, shot: Shot) -> None:
-    if request.preview is not None:
+def _write_pictures(request: Request, shot: Shot, made: Collection[int]) -> None:
+    """Write the preview and the contact sheet of the frames that are made, if any is."""
+    shot = replace(shot, numbers=tuple(number for number in shot.numbers if number in made))
+    if request.preview is not None and shot.numbers:
         write_preview(shot, request.output, request.preview, rate=request.fps)
         LOG.info(f"wrote {request.preview}")
-    if request.contact_sheet is not None:
+    if request.contact_sheet is not None and shot.numbers:
         write_contact_sheet(shot, request.output, request.contact_sheet)
         LOG.info(f"wrote {request.contact_sheet}")

@@ -153,3 +153,17 @@ def test_both_are_written_by_one_command(shot_folder, tmp_path, capsys):
         image.load()
         assert image.info["timestamp"] + image.info["duration"] == SHORTEST / 12 * 1000
     assert cv2.imread(str(tmp_path / "sheet.png")).shape[1] == 2 * SHEET_WIDTH
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_pictures_have_the_frames_that_are_there(jobs, tmp_path, capsys):
+    """With --keep-going none was written where a frame had failed, without a word."""
+    folder, sheet = Scene(frames=4).write(tmp_path / "in"), tmp_path / "sheet.png"
+    victim = folder / "shot.1004.exr"
+    victim.write_bytes(victim.read_bytes()[:-2000])
+    words = ["denoise", str(folder), "-o", str(tmp_path / "out"), "--preset", "draft", "--keep-going", "--jobs", jobs]
+    assert main([*words, "--preview", str(tmp_path / "a.png"), "--contact-sheet", str(sheet)]) == 1
+    assert [path.name for path in (tmp_path / "out").glob("*.exr")] == ["shot.1001.exr"]
+    assert cv2.imread(str(sheet)).shape[1] == SHEET_WIDTH  # one frame
+    assert (tmp_path / "a.png").is_file()
+    assert f"wrote {sheet}" in words_in(capsys.readouterr().err)
