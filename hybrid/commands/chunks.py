@@ -89,9 +89,9 @@ class ChunkLog:
             raise typer.Exit(1)
 
 
-def log_stop() -> None:
-    """Log that Ctrl-C has stopped all chunks."""
-    LOG.error("stopped: what is finished is kept; the same command goes on from there")
+def log_stop(how: str) -> None:
+    """Log that Ctrl-C has stopped all chunks, and how the work goes on."""
+    LOG.error(f"stopped: what is finished is kept; {how} goes on from there")
 
 
 def run_jobs(jobs: int, title: str, chunks: Mapping[str, Chunk], unit: str = "frames") -> None:
@@ -105,7 +105,7 @@ def run_jobs(jobs: int, title: str, chunks: Mapping[str, Chunk], unit: str = "fr
     threads = {name: str(max(thread_count() // jobs, 1)) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")}
     with ThreadPoolExecutor(jobs) as pool:
         try:
-            with interruptible(log_stop):
+            with interruptible(partial(log_stop, "--resume")):
                 tasks = {
                     pool.submit(
                         run_command, chunk.arguments, stop.is_set, partial(log.add, name), environment=threads

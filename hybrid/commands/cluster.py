@@ -5,6 +5,7 @@ paths. Dask gives the chunk of a worker that has died to another worker, which s
 """
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from uuid import uuid4
 
@@ -44,7 +45,7 @@ def run_on_cluster(address: str, title: str, chunks: Mapping[str, Chunk], unit: 
             key = f"{topic}-{name}"
             tasks[client.submit(run_chunk, name, list(chunk.arguments), folder, topic, key=key, pure=False)] = name
         try:
-            with interruptible(log_stop):
+            with interruptible(partial(log_stop, "the same command")):
                 for task in as_completed(list(tasks), loop=client.loop):
                     try:
                         words = task.result()

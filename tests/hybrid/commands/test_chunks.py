@@ -88,7 +88,8 @@ def test_a_chunk_fails_alone(shot, tmp_path, capsys):
 
 @pytest.mark.posix
 def test_ctrl_c_stops_all_processes(monkeypatch):
-    ended, begun, wait = [], threading.Event(), chunks.wait
+    """It said that the same command went on, which makes all frames again."""
+    ended, said, begun, wait = [], [], threading.Event(), chunks.wait
 
     def run(arguments, stopped, add, *, environment):
         if arguments == ["second"]:
@@ -105,10 +106,12 @@ def test_ctrl_c_stops_all_processes(monkeypatch):
 
     monkeypatch.setattr(chunks, "run_command", run)
     monkeypatch.setattr(chunks, "wait", wait_for_chunks)
+    monkeypatch.setattr(chunks.LOG, "error", said.append)
     with pytest.raises(chunks.typer.Exit) as exit_:
         run_jobs(2, "denoise", {name: Chunk([name], 1) for name in ("first", "second", "third")})
     assert exit_.value.exit_code == 130
     assert sorted(ended) == [["first"], ["second"]]  # the third never began
+    assert said == ["stopped: what is finished is kept; --resume goes on from there"]
 
 
 def test_one_machine_and_one_process_at_a_time_are_asked_for(shot, tmp_path, capsys):

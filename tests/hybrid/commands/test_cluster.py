@@ -189,7 +189,7 @@ def test_ctrl_c_keeps_what_is_finished_and_stops_the_workers(cluster, shot, tmp_
     run.send_signal(signal.SIGINT)
     _, err = run.communicate()
     assert run.returncode == 130, err
-    assert "stopped: what is finished is kept" in err
+    assert "stopped: what is finished is kept; the same command goes on from there" in err
     assert len(contents(out)) < FRAMES
 
 
