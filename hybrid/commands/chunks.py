@@ -55,16 +55,17 @@ def _longest(names: Sequence[str]) -> str:
 
 
 class ChunkLog:
-    """Logs the progress and the warnings of all chunks, by the records of their processes."""
+    """Logs the progress, the warnings and the errors of all chunks, by the records of their processes."""
 
     def __init__(self, title: str, chunks: Mapping[str, Chunk], unit: str) -> None:
         self._chunks, self._shares = chunks, dict.fromkeys(chunks, 0.0)
         self._bar = Progress(title, sum(chunk.size for chunk in chunks.values()), unit)
         self._lock = threading.Lock()  # each chunk has a thread that reads its records
         self._failed: list[str] = []
+        self._errors: dict[str, list[str]] = {name: [] for name in chunks}  # those of each chunk that are logged
 
     def add(self, name: str, record: Mapping[str, Any]) -> None:
-        """Log a warning of a chunk, or advance the bar by its progress."""
+        """Log a warning or an error of a chunk, each error once, or advance the bar by its progress."""
         with self._lock:
             if "percent" in record:
                 size = self._chunks[name].size
@@ -73,11 +74,16 @@ class ChunkLog:
                     self._bar.advance(gained, record["message"])
             elif record["level"] == "warning":
                 LOG.warning(f"{name}: {record['message']}")
+            elif record["level"] == "error" and record["message"] not in self._errors[name]:
+                self._errors[name].append(record["message"])
+                LOG.error(f"{name}: {record['message']}")
 
     def end(self, name: str, fault: str) -> None:
-        """Log that a chunk is done, or its fault."""
+        """Log that a chunk is done, or its fault, without an error that is logged already."""
         if fault:
             self._failed.append(name)
+            for words in self._errors[name]:
+                fault = fault.replace(f": {words}", "")
             LOG.error(f"{name}: {fault}")
         else:
             self.add(name, {"percent": 100, "message": f"{name} done"})

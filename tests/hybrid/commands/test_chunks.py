@@ -1,6 +1,7 @@
 """Chunks of a shot in processes on this machine."""
 
 import os
+import re
 import signal
 import threading
 import time
@@ -84,6 +85,20 @@ def test_a_chunk_fails_alone(shot, tmp_path, capsys):
     assert "error: 1005: ended with 1" in said
     assert "chunks were not made: " in said
     assert "shot.1001.exr" in contents(tmp_path / "out")
+
+
+def test_the_reasons_why_frames_failed_are_told_once(shot, tmp_path, capsys):
+    """With --keep-going nothing said why: ended with 1: 2 frames could not be made."""
+    broken = tmp_path / "noisy"
+    broken.mkdir()
+    for path in shot.glob("*.exr"):
+        data = path.read_bytes()
+        (broken / path.name).write_bytes(data[: len(data) // 2] if "1005" in path.name else data)
+    assert main(["denoise", str(broken), "-o", str(tmp_path / "out"), *OPTIONS, "--keep-going", "--jobs", "2"]) == 1
+    said = capsys.readouterr().err
+    reasons = re.findall(r"error: (.*): frame (\d+): .*shot\.1005\.exr: damaged", said)
+    assert sorted(reasons) == [("1001-1003", "1003"), ("1004-1005", "1004"), ("1004-1005", "1005")]
+    assert said.count("2 frames could not be made: 1004-1005") == 1
 
 
 @pytest.mark.posix
