@@ -222,7 +222,7 @@ def _denoise(request: Request) -> None:
 
 @contextmanager
 def _failure_on_record(request: Request, shot: Shot) -> Iterator[None]:
-    """Leave a record of an error that comes before the first frame."""
+    """Leave a record of an error that comes before the first frame, but not over one that has frames."""
     try:
         yield
     except (ValueError, OSError) as error:
@@ -230,7 +230,9 @@ def _failure_on_record(request: Request, shot: Shot) -> Iterator[None]:
             first = output_path(request.output, shot, shot.numbers[0])
             name, spec = sequence_name(first), request.shot.shot
             record = Record(first.parent, name, shot.numbers, command="denoise", input=spec)
-            record.write(Timings(), "failed", error=one_line(error))
+            there = dict(read_records(first.parent, name))
+            if not there.get(record.path, {}).get("frames"):
+                record.write(Timings(), "failed", error=one_line(error))
         raise
 
 

@@ -166,3 +166,14 @@ def test_a_layer_that_makes_no_sense_ends_a_strict_run_and_is_on_record(tmp_path
     assert record["state"] == "failed"
     assert "is constant" in record["error"]
     assert main(words) == 0
+
+
+def test_a_run_that_fails_before_its_first_frame_leaves_the_record_of_one_that_made_frames(tmp_path, capsys):
+    """The record was replaced, and status counted the finished frames as failed."""
+    folder = Scene().write(tmp_path / "in")  # whose normal is constant
+    words = ["denoise", str(folder), "-o", str(tmp_path / "out"), "--preset", "draft"]
+    assert main(words) == 0
+    before = list(read_records(tmp_path / "out"))
+    assert main([*words, "--strict"]) == 1
+    assert list(read_records(tmp_path / "out")) == before
+    assert main(["status", str(tmp_path / "out")]) == 0
