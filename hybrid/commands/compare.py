@@ -49,20 +49,21 @@ class _Report:
 
     def check(self) -> None:
         """Raise an error for a report that cannot be written, before any method runs."""
-        if self.output is not None:
-            if missing := [name for name in ("jinja2", "matplotlib") if find_spec(name) is None]:
-                packages = " ".join(f'"{name}"' for name in missing)
-                words = f"expected: pip install {packages} (the table alone needs neither)"
-                raise ValueError(f"the page of --output needs {missing[0]}, which is not installed; {words}")
-            from hybrid.comparison.report import check_report
-
-            check_report(self.output, [folder / "results.json" for folder in self.with_report or ()])
+        missing = [name for name in ("jinja2", "matplotlib") if find_spec(name) is None]
+        if self.output is not None and missing:
+            packages = " ".join(f'"{name}"' for name in missing)
+            words = f"expected: pip install {packages} (the table alone needs neither)"
+            raise ValueError(f"the page of --output needs {missing[0]}, which is not installed; {words}")
         if self.output is None and (self.movies or self.keep_frames):
             option = "--movies" if self.movies else "--keep-frames"
             raise typer.BadParameter(f"{option} writes next to a page, expected --output with it")
         if self.output is not None and self.movies:
             check_movie(self.output / "movie.mp4")
         self.read_others()
+        if self.output is not None:  # last, as the folder is made
+            from hybrid.comparison.report import check_report
+
+            check_report(self.output, [folder / "results.json" for folder in self.with_report or ()])
 
     def read_others(self) -> list[Comparison]:
         return [read_comparison(folder / "results.json") for folder in self.with_report or ()]
@@ -73,9 +74,9 @@ class _Report:
         joined = Comparison(
             " + ".join(c.shot for c in others), tuple(join(others)), {}, join_ladders([c.ladder for c in others])
         )
+        self.show(others, joined)
         if self.output is not None:
             self.write(joined, None)
-        self.show(others, joined)
 
     def write(self, comparison: Comparison, images: ShotImages | None) -> None:
         from hybrid.comparison.report import Report, write_report  # needs jinja2 and matplotlib
@@ -115,16 +116,17 @@ def compare(
 ) -> None:
     """Run the methods, or join finished comparisons, and show the results."""
     report = _Report(**opt.take(_Report, how))
-    report.check()
     if shot is None or not reference:
         if shot is not None or reference or not report.with_report:
             raise typer.BadParameter("expected SHOT and --reference, or --with-report with finished comparisons")
+        report.check()
         report.show_joined()
         return
     if len(reference) > 2:
         raise typer.BadParameter(f"--reference is given {len(reference)} times, expected once or twice")
     if ladder and not level:
         raise typer.BadParameter("--ladder runs the methods on levels, expected --level with it")
+    report.check()
     read, strict = ShotInput(shot=shot, **how), how["strict"]
     alike, findings = validate_renders({"shot": read.open()}, strict=strict)
     noisy = alike["shot"]
@@ -154,6 +156,7 @@ def compare(
     with tempfile.TemporaryDirectory() as folder:
         halves = clean[0] if len(clean) == 1 else (clean[0], clean[1])
         comparison = compare_shot(noisy, halves, chosen, options, folder=Path(folder), on_step=partial(bar.advance, 1))
+        report.show([comparison, *report.read_others()], comparison)
         if report.output is not None:
             from hybrid.comparison.report import report_images
 
@@ -163,7 +166,6 @@ def compare(
             report.write(comparison, images)
             if report.keep_frames:
                 _write_frames(report.output / FRAMES, noisy, images)
-    report.show([comparison, *report.read_others()], comparison)
 
 
 def _open_matching(spec: str, shot: Shot, frames: str | None) -> Shot:

@@ -5,6 +5,7 @@ templates are in `hybrid.comparison.page`.
 """
 
 import math
+import tempfile
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -57,7 +58,6 @@ def write_report(folder: Path | str, report: Report) -> Path:
     """Write `FILES` into a folder (``ladder.png`` with a ladder alone), named as results; return the page's path."""
     folder, results = Path(folder), report.comparison.results
     check_report(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     embedded = _embed(folder, report)
     document = to_document(report.comparison)
     write_file(folder / "results.json", to_json(document, indent=1))
@@ -72,7 +72,7 @@ def write_report(folder: Path | str, report: Report) -> Path:
 
 
 def check_report(folder: Path, inputs: Sequence[Path] = ()) -> None:
-    """Raise ValueError or OSError if a report would overwrite an input, or files of another origin."""
+    """Make the folder of a report; raise ValueError or OSError if an input or a file of other origin would be lost."""
     check_outputs([("report", folder / name) for name in FILES], [("results", path) for path in inputs])
     if there := [folder / name for name in (*FILES, MOVIES) if (folder / name).exists()]:
         try:
@@ -80,6 +80,12 @@ def check_report(folder: Path, inputs: Sequence[Path] = ()) -> None:
         except (OSError, ValueError):
             words = f"{there[0]} exists and was not written by ravg compare: expected another folder"
             raise ValueError(words) from None
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise type(error)(error.errno, f"cannot write a report: {error.strerror}", str(folder)) from None
 
 
 def report_images(

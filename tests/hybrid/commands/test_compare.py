@@ -49,6 +49,43 @@ def test_a_hostile_name_is_shown_as_it_is(
     assert {path.name for path in tmp_path.iterdir()} == {"noisy", "clean", "out"}
 
 
+@pytest.mark.parametrize("full", [False, True])
+def test_a_report_that_cannot_be_written_is_refused_before_anything_runs(
+    full: bool,
+    shots: tuple[Path, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It was found when all methods had run, and their table was lost."""
+
+    def refuse(**_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    place = tmp_path / "report"
+    if full:
+        monkeypatch.setattr("hybrid.comparison.report.tempfile.TemporaryFile", refuse)
+    else:
+        place.write_text("mine")
+    monkeypatch.setattr("hybrid.commands.compare.compare_shot", lambda *_, **__: pytest.fail("methods ran"))
+    noisy, clean = map(str, shots)
+    assert main(["compare", noisy, "--reference", clean, "--methods", "noisy", "-o", str(place)]) == 1
+    assert f"error: {place}: cannot write a report: " in capsys.readouterr().err
+
+
+def test_the_table_is_printed_though_the_report_cannot_be_written(
+    shots: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("hybrid.comparison.report.write_report", refuse)
+    noisy, clean = map(str, shots)
+    words = ["compare", noisy, "--reference", clean, "--methods", "noisy", "--rounds", "1", "-o", str(tmp_path / "r")]
+    assert main(words) == 1
+    assert "noisy" in capsys.readouterr().out
+
+
 def test_without_jinja_the_page_is_refused_before_anything_runs(shots: tuple[Path, Path], tmp_path: Path) -> None:
     noisy, clean = shots
     code = "import sys; sys.modules['jinja2'] = None; from hybrid.cli import main; sys.exit(main(sys.argv[1:]))"
