@@ -248,7 +248,10 @@ class _KeptPictures:
             name = _folder_name(shot.view)
             path = path.with_name(name) / path.name if path.suffix.lower() == ".exr" else path / name
         # Neighbours of the requested frames are kept too.
-        self.places = {number: output_path(path, shot, number, include_context=True) for number in shot.files}
+        self.places = {
+            number: output_path(path, shot, number, include_context=True, option="keep-first-pass")
+            for number in shot.files
+        }
         self._shot = shot
         self._facts = {
             "estimate": mode,

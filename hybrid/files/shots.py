@@ -373,25 +373,28 @@ def open_matching_sequence(spec: str | Path, shot: Shot, *, frames: str | None =
     return opened
 
 
-def output_path(pattern: str | Path, shot: Shot, number: int, *, include_context: bool = False) -> Path:
+def output_path(
+    pattern: str | Path, shot: Shot, number: int, *, include_context: bool = False, option: str = "output"
+) -> Path:
     """Return the file of a frame's result; with `include_context` frames that were not asked for get files too.
 
     The pattern is ``OUT.####.exr``, ``OUT.%04d.exr``, one file name for a shot of one frame, or a folder (an existing
-    one, or any name without ``.exr``), which keeps the input's file names. Raises ValueError if several frames would
-    get one name, an input file would be overwritten, or a name with a place for the number does not end in ``.exr``.
+    one, or any name without ``.exr``), which keeps the input's file names. Raises ValueError, which names the `option`,
+    if several frames would get one name, an input file would be overwritten, or a name with a place for the number does
+    not end in ``.exr``.
     """
     pattern = str(pattern)
     names, _ = parse_pattern(pattern)
     if names.digits and not names.after.lower().endswith(".exr") and not Path(pattern).is_dir():
-        raise ValueError(f"output {pattern!r} does not end in .exr, expected {pattern}.exr, or a folder without ####")
+        raise ValueError(f"{option} {pattern!r} does not end in .exr, expected {pattern}.exr, or a folder without ####")
     if Path(pattern).is_dir() or names.path(number).suffix.lower() != ".exr":
         path = Path(pattern) / shot.path(number).name
     else:
         count = len(shot.files if include_context else shot)
         if not names.digits and count > 1:
-            raise ValueError(f"output {pattern!r} names one file for {count} frames, expected OUT.####.exr")
+            raise ValueError(f"{option} {pattern!r} names one file for {count} frames, expected OUT.####.exr")
         path = names.path(number)
     # Not only its own input: frames still to come need the noisy neighbours.
     if shot.is_input(path):
-        raise ValueError(f"output {str(path)!r} would overwrite an input frame")
+        raise ValueError(f"{option} {str(path)!r} would overwrite an input frame")
     return path

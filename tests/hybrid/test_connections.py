@@ -226,6 +226,14 @@ def test_nothing_that_is_not_finite_is_written_of_any_view(tmp_path, where):
     assert not list((tmp_path / "out").glob("*.exr"))
 
 
+def test_a_first_pass_that_cannot_be_kept_is_refused_by_its_own_option(shot_folder, tmp_path, capsys):
+    """The error named the output."""
+    pytest.importorskip("pyoidn")
+    words = ["denoise", str(shot_folder), "-o", str(tmp_path / "out"), "--method", "classical"]
+    assert main([*words, "--first-pass", "oidn-fast", "--keep-first-pass", str(tmp_path / "k.exr")]) == 1
+    assert "error: keep-first-pass" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("keep_context", [False, True])
 def test_one_name_for_several_frames_is_refused_with_those_beside_them(shot_folder, tmp_path, keep_context):
     """A first pass is kept of neighbours too."""
