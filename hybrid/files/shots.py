@@ -287,8 +287,14 @@ def open_shot(
     FileNotFoundError
         If nothing matches; names the pattern and the files of the folder.
     ValueError
-        If the folder has several sequences, or `frames` is not a range.
+        If the folder has several sequences, `frames` is not a range, or another argument is not as described.
     """
+    if isinstance(aovs, str):
+        raise ValueError(f"aovs is {aovs!r}, expected a list of names: [{aovs!r}]")
+    if not isinstance(profile, Profile | None):
+        raise ValueError(f"profile is {profile!r}, expected a Profile, as hybrid.files.profile.open_profile returns it")
+    if not isinstance(keep, int) or keep < 0:
+        raise ValueError(f"keep is {keep!r}, expected a number of frames, at least 0")
     layers = dict(layers or {})
     sequences = {role: x for role, x in layers.items() if isinstance(x, str) and names_sequence(x)}
     if "color" in sequences:

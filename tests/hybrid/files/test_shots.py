@@ -262,6 +262,24 @@ def test_output_of_several_frames_needs_a_placeholder_and_may_not_be_the_input(t
         output_path(tmp_path / "shot.0009.exr", open_shot(tmp_path, frames="8"), 8)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        ({"aovs": "all"}, r"aovs is 'all', expected a list of names: \['all'\]"),
+        (
+            {"profile": "cycles"},
+            "profile is 'cycles', expected a Profile, as hybrid.files.profile.open_profile returns",
+        ),
+        ({"keep": -1}, "keep is -1, expected a number of frames, at least 0"),
+        ({"keep": "2"}, "keep is '2', expected a number of frames, at least 0"),
+    ],
+)
+def test_arguments_of_another_kind_are_refused(tmp_path, arguments, error):
+    """The first had no layer 'a'; the others ended in an AttributeError, a KeyError and a TypeError."""
+    with pytest.raises(ValueError, match=error):
+        open_shot(save_frames(tmp_path, [1]), **arguments)
+
+
 # --- shots made from a shot
 
 
