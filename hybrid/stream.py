@@ -170,12 +170,12 @@ class FrameStream:
 
     # Windows.
 
-    def window(self, number: int, radius: int | None = None, *, noisy: bool = False) -> Window:
-        """Collect the window around a frame, `radius` or that of the stream; `noisy` without the first pass.
+    def window(self, number: int, *, noisy: bool = False) -> Window:
+        """Collect the window around a frame; `noisy` without the first pass.
 
         Raises ValueError or OSError if a frame cannot be read, or does not fit the others.
         """
-        numbers = self.around(number, radius)
+        numbers = self.around(number)
         with_first_pass = not noisy and self.source is not None
         # Frame by frame, as a first pass may need the frame as read, which is dropped then.
         pairs = [(self.frame(n), self.denoised(n) if with_first_pass else None) for n in numbers]

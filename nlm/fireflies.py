@@ -175,9 +175,9 @@ def remove_highlights(color: Floats, pixels: Places) -> Floats:
     return clean
 
 
-def clamp_halos(picture: Floats, places: Places, radius: int = 3) -> Floats:
+def clamp_halos(picture: Floats, places: Places) -> Floats:
     """Clamp a picture (H, W, C) around highlights to the brightest of the ring, if nearest to them, around a halo."""
-    held = picture.copy()
+    held, radius = picture.copy(), 3
     middles = np.zeros(picture.shape[:2], np.uint8)
     middles[places[:, 0], places[:, 1]] = 1
     near = cv2.dilate(middles, np.ones((2 * radius + 1, 2 * radius + 1), np.uint8))

@@ -100,14 +100,14 @@ def log_stop(how: str) -> None:
     LOG.error(f"stopped: what is finished is kept; {how} goes on from there")
 
 
-def run_jobs(jobs: int, title: str, chunks: Mapping[str, Chunk], unit: str = "frames") -> None:
+def run_jobs(jobs: int, title: str, chunks: Mapping[str, Chunk]) -> None:
     """Run chunks, by name, on this machine, so many at a time, which share its cores, and log their progress.
 
     Raises typer.Exit with 1 if a chunk failed, after all others ended, or with 130 for Ctrl-C.
     """
     from loops.parallel import thread_count  # here, since numba takes a second to load
 
-    log, stop = ChunkLog(title, chunks, unit), threading.Event()
+    log, stop = ChunkLog(title, chunks, "frames"), threading.Event()
     threads = {name: str(max(thread_count() // jobs, 1)) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")}
     with ThreadPoolExecutor(jobs) as pool:
         try:
