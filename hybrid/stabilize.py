@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from flow.warp import warp
 from hybrid.alignment.align import align, align_results, measure_stillness
 from hybrid.alignment.prepare import PreparedFrame
-from hybrid.alignment.transfer import measure_exposure
+from hybrid.alignment.transfer import measure_typical_exposure
 from hybrid.alignment.unfiltered import as_gray
 from hybrid.alignment.window import AlignedWindow, Trust, Window
 from hybrid.plan import Plan
@@ -267,7 +267,7 @@ class FrameDenoiser:
     ) -> Denoised:
         """The denoised frame with its samples' means, and samples where they are certain, as in moving lights."""
         color, timings = denoised.color, self.stream.timings
-        exposure, sides, rendered = measure_exposure(color), result.neighbour_samples, frame.rendered
+        exposure, sides, rendered = measure_typical_exposure(color), result.neighbour_samples, frame.rendered
         radiance = frame.radiance if frame.removed_samples else rendered
         self.stream.keeper.release()  # the frame's own layers, of which this is made
         shown = [rendered] if sides is None else [rendered, sides.mean]
@@ -390,7 +390,7 @@ def _excess(
     0 where it is not `inside` (H, W).
     """
     shown, rendered = channel_mean(picture), channel_mean(frame.rendered)
-    exposure = np.float32(measure_exposure(picture))
+    exposure = np.float32(measure_typical_exposure(picture))
 
     def exceed(shown: Array) -> Excess:
         counted = frame.valid if inside is None else frame.valid & inside

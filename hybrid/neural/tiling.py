@@ -13,7 +13,10 @@ Block = tuple[slice, slice]
 def tensor_of(window: Array, *, copied: bool = True) -> torch.Tensor:
     """Convert layers (T, H, W, C) to a tensor ``(1, T, C, H, W)``, a view of the array unless `copied`."""
     planes = window.transpose(0, 3, 1, 2)
-    return torch.from_numpy(np.ascontiguousarray(planes) if copied else planes)[None]
+    if copied:
+        planes = np.ascontiguousarray(planes)
+    # torch warns of an array that is read-only, as those of callers may be.
+    return torch.from_numpy(planes if planes.flags.writeable else planes.copy())[None]
 
 
 def image_of(tensor: torch.Tensor) -> Array:

@@ -55,6 +55,32 @@ def test_the_network_scales_with_the_light(network, record_property):
 
 
 @pytest.mark.neural
+@pytest.mark.filterwarnings("error")  # the guides are read-only
+@pytest.mark.parametrize(
+    ("options", "factor"), [({"preset": "final"}, 1.5), ({"preset": "fast", "first_pass": "bundled"}, 4)], ids=str
+)
+def test_a_bright_window_lets_no_noise_into_the_room(options, factor):
+    """Errors of the room were measured against the mean with the window, and samples blended in for 2 to 6 dB."""
+    pytest.importorskip("torch")
+    size, rng = (64, 96), np.random.default_rng(3)
+    truth = np.broadcast_to(np.linspace(0.2, 0.4, size[1], dtype=np.float32)[:, None], (*size, 3))
+    albedo = np.full_like(truth, 0.5)
+
+    def room_error(window):
+        lit = truth.copy()
+        lit[:40, :40] = window
+        guides = {"albedo": albedo, "normal": np.broadcast_to(np.float32([0, 0, 1]), truth.shape)}
+        grain = rng.gamma(8, 1 / 8, (5, *size, 1)).astype(np.float32)
+        grain[:, :40, :40] = 1
+        frames = [{"color": lit * one, **guides} for one in grain]
+        (made,) = denoise_arrays(frames, numbers=[2], **options)
+        beside = np.s_[46:, :40]
+        return np.sqrt(np.mean(np.square(made.layers["color"][beside] / lit[beside] - 1)))
+
+    assert room_error(300.0) < factor * room_error(0.3)
+
+
+@pytest.mark.neural
 @pytest.mark.parametrize("options", [{"preset": "final"}, {"preset": "fast", "first_pass": "bundled"}], ids=str)
 def test_frames_beside_a_black_one_scale_with_the_light(options):
     """Pairs with a black frame were compared by an exposure of 1, and networks leave a little light on black."""

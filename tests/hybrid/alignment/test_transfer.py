@@ -9,6 +9,7 @@ from hybrid.alignment.transfer import (
     expand,
     measure_exposure,
     measure_gain,
+    measure_typical_exposure,
     remodulate,
 )
 
@@ -87,6 +88,15 @@ def test_a_room_beside_a_window_counts_in_the_gain(window):
     image = np.ones((96, 192, 3), np.float32)
     image[:48, :128] = window
     assert measure_gain(image) == pytest.approx(0.18 / window ** (1 / 3), rel=0.01)
+
+
+def test_the_typical_exposure_is_less_than_the_mean_beside_a_window_alone():
+    image = np.random.default_rng(7).uniform(0.5, 1.5, (96, 192, 3)).astype(np.float32)
+    assert measure_typical_exposure(image) == measure_exposure(image)
+    image[:48, :128] = 100
+    assert measure_exposure(image) > 30
+    assert measure_typical_exposure(image) == pytest.approx(2 * 100 ** (1 / 3), rel=0.02)
+    assert measure_typical_exposure(64 * image) == pytest.approx(64 * measure_typical_exposure(image), rel=1e-5)
 
 
 def test_exposure_of_a_lit_image_is_its_mean_without_the_brightest_hundredth():
