@@ -313,7 +313,7 @@ def _warp_first_pass(
     """Warp first passes to these rows, (T, h, W, 3); the centre's, with coverage 0, where a neighbour has none."""
     middle = first_pass[len(first_pass) // 2]
     if middle is None:
-        raise ValueError(f"frame {window.centre.number} has no estimate, expected one like its neighbours")
+        raise ValueError(f"frame {window.centre.number} has no first pass, expected one like its neighbours")
     warped = np.empty((len(first_pass), *middle[rows].shape), np.float32)
     for index, (there, link) in enumerate(zip(first_pass, window.links, strict=True)):
         if link is None or there is None:

@@ -83,9 +83,10 @@ def trust_light(
     *,
     agreeing: float = AGREEING,
 ) -> Array:
-    """Combine confidence c, coverage and gate g, each (T, h, W): max(c g, min(coverage, agreeing) g); c without "gate".
+    """Combine confidence c, coverage and gate g, each (T, h, W): max(c g, min(coverage, agreeing) g).
 
-    `agreeing` is the confidence that geometry leaves at least where the light agrees.
+    Without the stage "gate" c stands for c g. `agreeing` is the confidence that geometry leaves at least where the
+    light agrees.
     """
     trust = np.empty_like(confidence)
     given = confidence, coverage, np.ascontiguousarray(gate), np.float32(agreeing), "gate" in stages

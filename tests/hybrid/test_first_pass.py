@@ -209,7 +209,7 @@ def test_estimates_that_are_not_finite_are_repaired_and_others_refused(tmp_path)
     assert result.min() >= 0
     with pytest.raises(ValueError, match=r"first pass of frame \d+ has shape \(3, 4, 3\), expected \(48, 64, 3\)"):
         FrameStream(shot, only(STAGES), first_pass=PerFrame(lambda frame: np.ones((3, 4, 3), np.float32))).align(MIDDLE)
-    with pytest.raises(ValueError, match=f"frame {MIDDLE} has no estimate"):
+    with pytest.raises(ValueError, match=f"frame {MIDDLE} has no first pass"):
         FrameStream(shot, only(STAGES), first_pass=PerFrame(lambda frame: None)).align(MIDDLE)
     with pytest.raises(ValueError, match="expected a window with estimates"):
         gated_average(FrameStream(shot, only(STAGES)).align(MIDDLE))
