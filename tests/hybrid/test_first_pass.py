@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from hybrid import first_pass
+from hybrid.alignment.transfer import BLACK, measure_gain
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
 from hybrid.files import sources
@@ -93,6 +94,7 @@ def test_guides_are_prefiltered_where_they_hold_noise(tmp_path, monkeypatch):
     monkeypatch.setattr(first_pass, "why_no_oidn", lambda: None)
     monkeypatch.setattr(first_pass, "denoise_oidn", lambda color, *_, **mode: calls.append(mode) or color)
     shot = open_shot(SCENE.write(tmp_path))
+    scale = measure_gain(shot.read(MIDDLE).color, dark=BLACK)
     best = {"quality": "high", "prefilter": "high"}
     for mode, noisy, clean in (
         ("oidn", {"quality": "high"}, {"quality": "high"}),
@@ -103,7 +105,7 @@ def test_guides_are_prefiltered_where_they_hold_noise(tmp_path, monkeypatch):
         for stages, expected in ((STAGES | {"prefilter"}, noisy), (STAGES, clean)):
             calls.clear()
             FrameStream(shot, only(stages), radius=0, first_pass=find_first_pass(mode, shot).first_pass).align(MIDDLE)
-            assert calls == [{**expected, "device": "cpu"}]
+            assert calls == [{**expected, "device": "cpu", "scale": pytest.approx(scale)}]
 
 
 def test_frames_needed_are_those_that_are_read(tmp_path):
