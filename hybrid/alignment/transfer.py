@@ -139,8 +139,8 @@ def measure_gain(picture: Array, dark: float = DIM) -> float:
 def measure_typical_exposure(picture: Array) -> float:
     """Return the exposure of a picture (H, W, 3), or twice the geometric mean of what is lit, whichever is less.
 
-    Beside a window over a third of a picture, its mean would hide errors of the room: samples of the room came through
-    for 2 dB where the window has 100 times its light. In 38 of 40 rendered shots the first is less.
+    Beside a window over a third of a picture, its mean would hide errors of the room: the noise of the room then
+    came through, 2 dB where the window has 100 times its light. In 38 of 40 rendered shots the first is less.
     """
     exposure = measure_exposure(picture)
     return min(exposure, 2 * MIDDLE_GRAY * exposure / autoexposure(picture, dark=DIM, exposure=exposure))

@@ -73,12 +73,17 @@ def test_the_process_has_the_variables_and_hands_on_its_log(monkeypatch):
     assert records == [{"level": "warning", "message": "odd"}]
 
 
-def test_a_chunk_fails_alone(shot, tmp_path, capsys):
-    broken = tmp_path / "noisy"
-    broken.mkdir()
+def with_damaged_frame(shot, folder):
+    """Copy a shot, frame 1005 cut in half."""
+    folder.mkdir()
     for path in shot.glob("*.exr"):
         data = path.read_bytes()
-        (broken / path.name).write_bytes(data[: len(data) // 2] if "1005" in path.name else data)
+        (folder / path.name).write_bytes(data[: len(data) // 2] if "1005" in path.name else data)
+    return folder
+
+
+def test_a_chunk_fails_alone(shot, tmp_path, capsys):
+    broken = with_damaged_frame(shot, tmp_path / "noisy")
     words = ["denoise", str(broken), "-o", str(tmp_path / "out"), *OPTIONS, "--no-stages", "stabilize"]
     assert main([*words, "--jobs", "5"]) == 1
     said = capsys.readouterr().err
@@ -89,11 +94,7 @@ def test_a_chunk_fails_alone(shot, tmp_path, capsys):
 
 def test_the_reasons_why_frames_failed_are_told_once(shot, tmp_path, capsys):
     """With --keep-going nothing said why: ended with 1: 2 frames could not be made."""
-    broken = tmp_path / "noisy"
-    broken.mkdir()
-    for path in shot.glob("*.exr"):
-        data = path.read_bytes()
-        (broken / path.name).write_bytes(data[: len(data) // 2] if "1005" in path.name else data)
+    broken = with_damaged_frame(shot, tmp_path / "noisy")
     assert main(["denoise", str(broken), "-o", str(tmp_path / "out"), *OPTIONS, "--keep-going", "--jobs", "2"]) == 1
     said = capsys.readouterr().err
     reasons = re.findall(r"error: (.*): frame (\d+): .*shot\.1005\.exr: damaged", said)
