@@ -12,7 +12,6 @@ from hybrid.runtime.timing import Timings
 from nlm.average import average, robust_average
 from nlm.guided import guided_filter
 from nlm.nonlocal_means import joint_nlm
-from nlm.pooling import pool_samples
 
 # Weight of OIDN's result on the pooled samples against the average of first passes: errors of two images that are made
 # differently cancel in part. 0.12 dB over all of it, in the mean of thirteen shots.
@@ -104,11 +103,11 @@ def pool_and_denoise(aligned: AlignedWindow, *, device: str = "cpu", timings: Ti
     noisy image is then regressed on their difference) takes a third run of OIDN, and was worth 0.05 dB less than the
     constant on thirteen shots.
     """
-    if aligned.first_pass is None or (residual := aligned.residual) is None or aligned.centre_first_pass is None:
+    if aligned.centre_first_pass is None:
         raise ValueError("aligned: expected a window with estimates, got none")
     timings = timings or Timings()
     with timings.stage("pool"):
-        pooled = pool_samples(aligned.first_pass, residual, aligned.confidence, aligned.exposure)
+        pooled = aligned.pool()
         mean = pooled.average * aligned.modulation
         image = pooled.image * aligned.modulation
     with timings.stage("denoise"):

@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 Config = TypeVar("Config")
 
 FORMAT = "ravg-network"
-#: Raised when older weights would give other images.
-VERSION = 4
-#: Beginnings of the names of a `RobustUNet`'s tensors in version 3, with those of today.
-_NAMES_OF_3 = {"trunk": "backbone", "known": "aux_conv", "average": "robust_average", "keep": "average_blend"}
+#: Raised when older weights would give other images; and the versions that are read. A `RobustUNet` before version 5
+#: averaged features of the frames.
+VERSION = 5
+READ = ("3", "4", "5")
 #: The greatest weight that is read: a thousand times that of any network here. Greater weights give NaN images.
 HEAVIEST = 5e3
 #: Bounds of numbers in a description: two to four times those of any network here. And of all others.
@@ -140,33 +140,29 @@ def load_model(path: str | os.PathLike[str]) -> Model:
                 raise ValueError(f"description: expected at most {LONGEST} characters, got {len(text)}")
             description = json.loads(text)
             _refuse_huge(description)
+            if description["model"] == "RobustUNet" and metadata["version"] != str(VERSION):
+                raise ValueError(
+                    f"expected version {VERSION} of a RobustUNet, got {metadata['version']}, which averages features; "
+                    "train it anew (ravg train --init oidn)"
+                )
             with torch.device("meta"):  # shapes alone, which take no memory
                 expected = {name: tuple(value.shape) for name, value in build(description).state_dict().items()}
-        except (KeyError, ValueError, RecursionError) as error:
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
             raise ValueError(f"{where}: {_short(error)}") from error
-        names = {_name_of_today(name, metadata, description): name for name in file.keys()}  # noqa: SIM118 (no mapping)
-        found = {name: tuple(file.get_slice(stored).get_shape()) for name, stored in names.items()}
+        found = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118 (no mapping)
         if expected != found:
             name = min(key for key in expected.keys() | found.keys() if expected.get(key) != found.get(key))
             got = f"expected shape {expected.get(name)}, got {found.get(name)}"
             raise ValueError(f"{where}: {_short(name)}: {got}")
         if (count := sum(math.prod(shape) for shape in found.values())) > PARAMETERS:
             raise ValueError(f"{where}: expected at most {PARAMETERS:g} parameters, got {count}")
-        tensors = {name: file.get_tensor(stored) for name, stored in names.items()}
+        tensors = {name: file.get_tensor(name) for name in found}
     for name, value in tensors.items():
         if not value.is_floating_point() or not bool((value.abs() <= HEAVIEST).all()):
             raise ValueError(f"{where}: {name}: expected finite numbers up to {HEAVIEST:g}, got others")
     model = build(description)
     model.load_state_dict({name: value.float() for name, value in tensors.items()})
     return model
-
-
-def _name_of_today(name: str, metadata: Mapping[str, str], description: Mapping[str, Any]) -> str:
-    """Name that a tensor of a file has in this version."""
-    if metadata["version"] != "3" or description["model"] != "RobustUNet":
-        return name
-    head, dot, rest = name.partition(".")
-    return _NAMES_OF_3.get(head, head) + dot + rest
 
 
 def _refuse_huge(value: Any, name: str = "", depth: int = 0) -> None:
@@ -199,7 +195,7 @@ def _open(path: str | os.PathLike[str]) -> Iterator[tuple[Any, dict[str, str]]]:
             metadata = file.metadata() or {}
             if metadata.get("format") != FORMAT:
                 raise ValueError(f"{where}: expected format {FORMAT!r}, got {_short(repr(metadata.get('format')))}")
-            if metadata.get("version") not in ("3", str(VERSION)):
+            if metadata.get("version") not in READ:
                 raise ValueError(f"{where}: expected version {VERSION}, got {_short(metadata.get('version'))}")
             yield file, metadata
     except SafetensorError as error:

@@ -24,7 +24,7 @@ def _multiscale(frames: int) -> paper.MultiScale:
 
 
 PRESETS: dict[str, Preset] = {
-    # The final stage on OIDN's small, base and large U-Net: 0.3, 0.9 and 3.9 M parameters.
+    # The final stage with OIDN's small, base and large U-Net: 0.3, 0.9 and 3.9 M parameters.
     "fast": Preset(lambda frames: RobustUNet(RobustUNetConfig(frames, "small"))),
     "balanced": Preset(lambda frames: RobustUNet(RobustUNetConfig(frames, "base"))),
     "quality": Preset(lambda frames: RobustUNet(RobustUNetConfig(frames, "large", clean_guides=True)), frames=7),

@@ -1,143 +1,159 @@
-"""The robust average, and the Robust Average block with one weight per channel, which connects the frames of a window.
+"""The Robust Average block on images: for how much each frame of a window counts, at each pixel.
 
-Frames are stacked along the batch, ``(T·N, C, H, W)``, all samples of the first frame first: splitting them is a view.
+Kalojanov and Thurston 2023, "Robust Average Networks for Monte Carlo Denoising", section 3: frames are visited
+outermost first, the centre last; each is blended with the average a of the others, x ← (1 − w) x + w a, by one weight w
+per pixel and frame. Here x are noisy images of the centre, one from each frame, in place of features, and the others
+are the frames visited before. The paper's average drops the least and the greatest value; on linear radiance, whose
+noise is skewed, that darkens (docs/dev/experiments.md), so the weights alone reject outliers.
 """
 
-from collections.abc import Sequence
-from math import log
-from typing import Any
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
-from network.cpu.fused_ops import blend_channels, can_blend
-from network.cpu.training_ops import BlendChannels
+from network.transfer import pu_forward
+from nlm.pooling import RESIDUAL_LIMIT
 
-
-def ravg(frames: Sequence[Tensor]) -> Tensor:
-    """Mean of tensors of one shape after discarding the minimum and the maximum of each element.
-
-    Returns the mean of two frames, and a single frame itself. Raises ValueError without frames.
-    ``ravg(S) = (Σ x − max(S) − min(S)) / (|S| − 2)`` for ``|S| ≥ 3``, computed without forming ``Σ x``: beside
-    an outlier of 1e6 the subtraction would leave nothing of the other values in half precision. Where several
-    values are equally extreme, one of them gets the gradient. Kalojanov and Thurston 2023, "Robust Average Networks for
-    Monte Carlo Denoising", section 3, equation 1.
-    """
-    if len(frames) == 0:
-        raise ValueError("frames: expected at least one tensor, got none")
-    if len(frames) == 1:
-        return frames[0]
-    if len(frames) == 2:
-        return torch.lerp(frames[0], frames[1], 0.5)
-    kind = _MeanOfMiddleTwo if len(frames) == 4 else _MeanOfInner
-    average: Tensor = kind.apply(*frames)  # type: ignore[no-untyped-call]
-    return average
+#: Boxes, pixels, over which first passes are compared: a pixel, the detail and the light around it.
+SCALES = (1, 5, 17)
+#: Box, pixels, over which the noise of the centre is measured.
+NOISE_BOX = 9
+#: Inputs of the correction: three differences at each scale; noise, prior odds, confidence.
+FEATURES = 3 * len(SCALES) + 3
+#: Greatest correction of log-odds either way: a factor of 55, which excludes a frame, and no overflow.
+MOST = 4.0
+#: Least difference and noise that are told apart, on the transfer curve: one step of 8 bits.
+STEP = 1 / 255
 
 
-class _MeanOfInner(torch.autograd.Function):
-    """ravg of three frames or more. Autograd through its minima and maxima costs three times as much."""
+class UNetWindow(NamedTuple):
+    """An aligned window of T frames, float32."""
 
-    @staticmethod
-    def forward(ctx: Any, *frames: Tensor) -> Tensor:
-        low, high = torch.minimum(frames[0], frames[1]), torch.maximum(frames[0], frames[1])
-        total = torch.zeros_like(low)
-        for frame in frames[2:]:
-            # The middle one of (low, frame, high) can no longer be extreme: add it to the sum.
-            total += torch.minimum(frame, high).maximum(low)
-            low, high = torch.minimum(low, frame), torch.maximum(high, frame)
-        if any(ctx.needs_input_grad):
-            ctx.save_for_backward(low, high, *frames)
-        return total.div_(len(frames) - 2)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
-        low, high, *frames = ctx.saved_tensors
-        share = gradient / (len(frames) - 2)
-        gradients = [share.clone() for _ in frames]
-        # One frame is the minimum and another the maximum; among equal frames the first and the last.
-        for extreme, order in ((low, range(len(frames))), (high, reversed(range(len(frames))))):
-            left = torch.ones_like(share)
-            for i in order:
-                taken = torch.empty_like(share)
-                torch.eq(frames[i], extreme, out=taken).mul_(left)
-                left -= taken
-                gradients[i].addcmul_(taken, share, value=-1)
-        return tuple(gradients)
+    first_pass: Tensor  # ``(N, T, 3, H, W)`` irradiance: each frame denoised by itself
+    # ``(N, T, 3, H, W)`` irradiance of the noisy frames minus `first_pass`, each frame's in its own place, aligned to
+    # the nearest pixel
+    residual: Tensor
+    confidence: Tensor  # ``(N, T, 1, H, W)``, at least 0
+    modulation: Tensor  # ``(N, 3, H, W)``; radiance is irradiance times modulation
+    exposure: Tensor  # ``(N,)``, positive: brightness of the irradiance of whole frames
+    # ``(N,)``, positive: factor of radiance before the transfer curve (`hybrid.alignment.transfer.measure_gain`)
+    gain: Tensor
+    # ``(N, 3, H, W)`` guides of the centre, in [0, 1] and [−1, 1]
+    albedo: Tensor | None = None
+    normal: Tensor | None = None
 
 
-class _MeanOfMiddleTwo(torch.autograd.Function):
-    """ravg of four frames, the case of every step of a five-frame window.
+class Pooled(NamedTuple):
+    """The centre of a window, from the samples of all of its frames; irradiance."""
 
-    Sorted pairs (a, b) and (c, d) give the two middle values directly. Autograd through six minima and maxima
-    costs ten times this backward pass, which keeps four 0/1 masks in the data's own type (so that every pass
-    over memory is vectorised) and sends half the gradient to each of the two frames that were averaged.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
-        low_ab, high_ab = torch.minimum(a, b), torch.maximum(a, b)
-        low_cd, high_cd = torch.minimum(c, d), torch.maximum(c, d)
-        mean = torch.maximum(low_ab, low_cd).add_(torch.minimum(high_ab, high_cd)).mul_(0.5)
-        if any(ctx.needs_input_grad):
-            ctx.save_for_backward(
-                low_ab.ge_(low_cd),  # the lower middle value came from (a, b)
-                high_ab.le_(high_cd),  # the upper middle value came from (a, b)
-                low_cd.copy_(a).le_(b),
-                high_cd.copy_(c).le_(d),
-            )
-        return mean
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        lower_from_ab, upper_from_ab, a_is_lower, c_is_lower = ctx.saved_tensors
-        half = gradient * 0.5
-        # Every value below is 0, half or gradient, so the sums and differences are exact in any precision.
-        lower_ab, upper_ab = half * lower_from_ab, half * upper_from_ab
-        lower_cd, upper_cd = half - lower_ab, half - upper_ab
-        to_a = torch.lerp(upper_ab, lower_ab, a_is_lower)
-        to_c = torch.lerp(upper_cd, lower_cd, c_is_lower)
-        return to_a, lower_ab.add_(upper_ab).sub_(to_a), to_c, lower_cd.add_(upper_cd).sub_(to_c)
-
-
-class ChannelAverage(nn.Module):
-    """Robust Average block with one weight per channel, at first `blend`, the same in all pixels.
-
-    For each frame i, outermost frames first and the centre last, with the results of the earlier steps in place:
-    ``a = ravg(x_j, j ≠ i)``, ``x_i ← (1 − w) x_i + w a``, with ``w = sigmoid(b)``, b learned. Without gradients, on a
-    CPU, the block is one pass over memory (`network.cpu.fused_ops`), where torch needs one for each of forty
-    operations.
-
-    Behind the first convolution of a pretrained backbone, weights that two 1×1 convolutions predicted in each pixel, as
-    those of `network.paper.blocks.RobustAverage`, varied by less than 0.05 about 0.8 once they were trained, and the
-    pictures were 0.01 dB worse.
-    """
-
-    def __init__(self, channels: int, blend: float) -> None:
-        super().__init__()
-        self.blend = nn.Parameter(torch.full((channels,), log(blend / (1 - blend))))
-
-    def forward(self, x: Tensor, frames: int, centre: bool = False, common: Tensor | None = None) -> Tensor:
-        """Blend ``(T·N, C, H, W)`` over time; with `centre`, return ``(N, C, H, W)`` of the centre frame alone.
-
-        With `common` ``(N, C, H, W)`` that is added to each frame returned, and a ReLU follows.
-        """
-        weight, order = torch.sigmoid(self.blend), outermost_first(frames)
-        if can_blend(x, frames):
-            returned = [frames // 2] if centre else list(range(frames))
-            if not torch.is_grad_enabled():
-                return blend_channels(x, frames, order, weight, returned, common)
-            if x.dtype == weight.dtype == torch.float32:
-                blended: Tensor = BlendChannels.apply(x, frames, order, weight, returned, common)  # type: ignore[no-untyped-call]
-                return blended
-        state, weight = list(x.chunk(frames)), weight.to(x.dtype)[:, None, None]
-        for i in order if frames > 1 else ():
-            state[i] = torch.lerp(state[i], ravg(state[:i] + state[i + 1 :]), weight)
-        images = [state[frames // 2]] if centre else state
-        if common is not None:
-            images = [torch.relu(image + common) for image in images]
-        return torch.cat(images)
+    image: Tensor  # ``(N, 3, H, W)``: noisy, unbiased
+    average: Tensor  # ``(N, 3, H, W)``: average of the first passes
+    parts: Tensor  # ``(N, T, 3, H, W)``: contribution of each frame to the image
+    share: Tensor  # ``(N, T, 1, H, W)``: share of each frame, which add up to 1
 
 
 def outermost_first(frames: int) -> list[int]:
     """Order in which a Robust Average block visits the frames of a window: 0, 4, 1, 3, 2 for five."""
     return sorted(range(frames), key=lambda i: (-abs(i - frames // 2), i))
+
+
+def pool(window: UNetWindow, weight: Tensor) -> Pooled:
+    """Average the frames' images of the centre by ``(N, T, 1, H, W)`` weights, with gradients.
+
+    The formula is that of `nlm.pooling.pool_samples`, which is one pass over memory, without gradients.
+    """
+    centre = weight.shape[1] // 2
+    total = weight.sum(1, keepdim=True)
+    known = total > 0
+    alone = torch.zeros_like(weight)
+    alone[:, centre] = 1
+    share = torch.where(known, weight / torch.where(known, total, 1), alone)
+    light = window.first_pass.mean(2, keepdim=True).clamp_min(0) + window.exposure.view(-1, 1, 1, 1, 1)
+    limit = float(RESIDUAL_LIMIT) * light
+    excess = window.residual.mean(2, keepdim=True).abs()
+    parts = share * (window.first_pass + window.residual * (known * limit / torch.maximum(excess, limit)))
+    return Pooled(parts.sum(1), (share * window.first_pass).sum(1), parts, share)
+
+
+class RobustAverage(nn.Module):
+    """Robust Average block: weights of the frames of a window.
+
+    The recursion, with c the confidence and s the frames in the order of `outermost_first`, is
+
+        w_s = σ(log(Σ c / c_s) + f_s),    x_s ← (1 − w_s) x_s + w_s a_s,
+
+    where Σ c is over the frames visited before, a_s is their result, and x_t of the centre t is the result of the
+    block. The prior odds are those of the confidence, so that with f = 0 the result is Σ c x / Σ c, and a neighbour of
+    no confidence does not count. As a step multiplies the weight of all frames before it by exp(f_s), the weights of
+    the block are c_i Π exp(f_s) over the steps s after i, and x is averaged once.
+
+    The correction f of a step, in [−4, 4], is predicted by three convolutions at half size from the differences between
+    the first passes of the frame, of the average so far and of the centre, over the noise of the centre, at three
+    scales; the noise; the prior odds; and the confidence. The last convolution starts at zero, and while it is zero
+    nothing is computed.
+    """
+
+    def __init__(self, width: int = 16) -> None:
+        super().__init__()
+        layers = [nn.Conv2d(i, o, 3, padding=1) for i, o in ((FEATURES, width), (width, width), (width, 1))]
+        nn.init.zeros_(layers[-1].weight)
+        nn.init.zeros_(cast(Tensor, layers[-1].bias))
+        self.correction = nn.Sequential(layers[0], nn.ReLU(), layers[1], nn.ReLU(), layers[2])
+
+    @property
+    def is_prior(self) -> bool:
+        """Whether f is 0 everywhere: the weights are then the confidence."""
+        return not any(bool(value.any()) for value in cast(nn.Module, self.correction[-1]).parameters())
+
+    def forward(self, window: UNetWindow) -> Tensor:
+        """Return the weights ``(N, T, 1, H, W)``, at least 0."""
+        if self.is_prior and not torch.is_grad_enabled():
+            return window.confidence
+        weights = list(window.confidence.unbind(1))
+        first, *following = outermost_first(len(weights))
+        scale = window.modulation * window.gain.view(-1, 1, 1, 1)
+        images = window.first_pass.unbind(1)
+        centre = images[len(images) // 2]
+        noisy = _encode(centre + window.residual[:, len(images) // 2], scale)
+        noise = (_box((noisy - _encode(centre, scale)).square().mean(1, keepdim=True), NOISE_BOX)).sqrt() + STEP
+        visited = [first]
+        for frame in following:
+            before = sum((weights[i] for i in visited), torch.zeros_like(weights[frame]))
+            mean = sum((weights[i] * images[i] for i in visited), torch.zeros_like(centre))
+            average = torch.where(before > 0, mean / torch.where(before > 0, before, 1), centre)
+            features = self._features(images[frame], average, centre, scale, noise, before, weights[frame])
+            factor = self._correct(features).exp()
+            for i in visited:
+                weights[i] = weights[i] * factor
+            visited.append(frame)
+        return torch.stack(weights, 1)
+
+    def _features(
+        self, image: Tensor, average: Tensor, centre: Tensor, scale: Tensor, noise: Tensor, before: Tensor, own: Tensor
+    ) -> Tensor:
+        """Inputs ``(N, FEATURES, H, W)`` of the correction of a step."""
+        encoded = [_encode(x, scale) for x in (image, average, centre)]
+        pairs = [encoded[i] - encoded[j] for i, j in ((0, 1), (0, 2), (1, 2))]
+        sizes = [_box(pair, box).abs().mean(1, keepdim=True) + STEP for pair in pairs for box in SCALES]
+        # The smallest share that matters, so that the logarithm is finite where a frame has no confidence.
+        odds = ((before + 1e-3) / (own + 1e-3)).log()
+        return torch.cat([*((size / noise).log() for size in sizes), noise.log(), odds, own], 1)
+
+    def _correct(self, features: Tensor) -> Tensor:
+        """The correction f of a step, ``(N, 1, H, W)``."""
+        size = features.shape[-2:]
+        half = self.correction(functional.avg_pool2d(features, 2, ceil_mode=True))
+        return functional.interpolate(MOST * torch.tanh(half / MOST), size, mode="bilinear", align_corners=False)
+
+
+def _encode(irradiance: Tensor, scale: Tensor) -> Tensor:
+    """Radiance on the transfer curve."""
+    return pu_forward((irradiance * scale).clamp_min(0))
+
+
+def _box(image: Tensor, size: int) -> Tensor:
+    """Box mean, of the pixels within the image."""
+    return functional.avg_pool2d(image, size, 1, size // 2, count_include_pad=False) if size > 1 else image
+

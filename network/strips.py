@@ -9,24 +9,20 @@ from torch import Tensor
 ROWS = 192
 
 
-def in_strips(
-    run: Callable[..., Sequence[Tensor]], margin: int, *layers: Tensor, all_frames: bool = False
-) -> list[Tensor]:
+def in_strips(run: Callable[..., Sequence[Tensor]], margin: int, *layers: Tensor) -> list[Tensor]:
     """Run a local function strip by strip and join the results; with gradients, on all rows at once.
 
     `margin` is how many rows of the finest layer an output row depends on, on each side; layers are ``(..., H, W)``,
-    coarser ones with H / 2, H / 4, ... rows. With layers of all frames of a window strips have a quarter as many rows.
-    Convolutions of 32 channels take 0.6 of the time that they take on a whole frame, and no more than the features of a
-    strip is in memory.
+    coarser ones with H / 2, H / 4, ... rows. Convolutions of 32 channels take 0.6 of the time that they take on a whole
+    frame, and no more than the features of a strip is in memory.
     """
     height = max(layer.shape[-2] for layer in layers)
-    rows = ROWS // 4 if all_frames else ROWS
-    if torch.is_grad_enabled() or height <= rows:
+    if torch.is_grad_enabled() or height <= ROWS:
         return list(run(*layers))
     margin += margin % 2  # the strip of a layer of half the size has to begin at a whole row
     joined: list[Tensor] = []
-    for top in range(0, height, rows):
-        stop = min(top + rows, height)
+    for top in range(0, height, ROWS):
+        stop = min(top + ROWS, height)
         first, last = max(top - margin, 0), min(stop + margin, height)
         parts = run(*(_rows(layer, first, last, height) for layer in layers))
         if not joined:

@@ -6,8 +6,9 @@ of ``training/`` in RenderKit/oidn, Apache-2.0 (see NOTICE).
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import TypeVar, cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -18,6 +19,8 @@ from network.cpu.fused_ops import can_project, convolve_to_rgb, halve, with_low_
 from network.cpu.upsample_conv import UpsampleTaps, can_upsample, convolve_upsampled, merge_taps
 from network.strips import in_strips
 from network.transfer import LARGEST, clip, srgb_forward, srgb_inverse
+
+Module = TypeVar("Module", bound=nn.Module)
 
 #: Channels of the convolutions at each scale of the encoder, finest first.
 ENCODERS: dict[str, tuple[tuple[int, ...], ...]] = {
@@ -31,6 +34,9 @@ DECODERS: dict[str, tuple[tuple[int, ...], ...]] = {
     "base": ((112, 112), (96, 96), (64, 64), (64, 32)),
     "large": ((192, 192), (128, 128), (96, 96), (64, 64)),
 }
+#: Pixels of mirroring beyond the borders: rows before and after, columns before and after.
+Borders = tuple[tuple[int, int], tuple[int, int]]
+NO_BORDERS: Borders = ((0, 0), (0, 0))
 
 
 @dataclass(frozen=True)
@@ -160,6 +166,14 @@ class Stage(nn.Sequential):
         return x
 
 
+def channels_last(model: Module) -> Module:
+    """Convert the weights of all convolutions to the memory format of their activations, channels last; in place."""
+    for parameter in model.parameters():
+        if parameter.ndim == 4:
+            parameter.data = parameter.data.to(memory_format=torch.channels_last)
+    return model
+
+
 def check_size(name: str, layer: Tensor, multiple: int) -> None:
     """Raise ValueError unless height and width of a named layer ``(..., H, W)`` are positive multiples of a number."""
     for axis, length in zip(("height", "width"), layer.shape[-2:], strict=True):
@@ -167,30 +181,35 @@ def check_size(name: str, layer: Tensor, multiple: int) -> None:
             raise ValueError(f"{name}: expected a {axis} that is a multiple of {multiple}, got {length}")
 
 
-@torch.inference_mode()
 def denoise_color(
-    unet: OidnUNet, color: Tensor, albedo: Tensor | None = None, normal: Tensor | None = None, *, exposure: float
+    unet: OidnUNet,
+    color: Tensor,
+    albedo: Tensor | None = None,
+    normal: Tensor | None = None,
+    *,
+    exposure: Tensor | float,
+    borders: Borders = NO_BORDERS,
 ) -> Tensor:
     """Denoise images as OIDN does: ``(N, 3, H, W)`` linear radiance, float32, at least 0.
 
     NaN and negative values of the color count as 0; albedo is clipped to [0, 1], normals in any fixed space to [−1, 1].
-    The exposure is a factor of the color, of the whole image (`hybrid.alignment.transfer.autoexposure`).
+    The exposure is a factor of the color, of the whole image (`hybrid.alignment.transfer.autoexposure`), ``(N,)`` or
+    one number. Layers are mirrored beyond their borders, as far as `borders` says; beyond that the network sees 0.
     """
-    layers = [(color, lambda x: encode(clip(x * exposure, 0, LARGEST)))]
+    factor = exposure.view(-1, 1, 1, 1) if isinstance(exposure, Tensor) else exposure
+    layers = [(color, lambda x: encode(clip(x * factor, 0, LARGEST)))]
     if albedo is not None:
         layers.append((albedo, lambda x: clip(x, 0, 1)))
     if normal is not None:
         layers.append((normal, normal_to_unit))
-    return _run(unet, layers, lambda x: decode(x) / exposure)
+    return _run(unet, layers, lambda x: decode(x) / factor, borders)
 
 
-@torch.inference_mode()
 def denoise_albedo(unet: OidnUNet, albedo: Tensor) -> Tensor:
     """Denoise albedo ``(N, 3, H, W)`` in [0, 1] by itself, with OIDN's weights for albedo."""
     return _run(unet, [(albedo, lambda x: srgb_forward(clip(x, 0, 1)))], lambda x: srgb_inverse(x.clamp(0, 1)))
 
 
-@torch.inference_mode()
 def denoise_normal(unet: OidnUNet, normal: Tensor) -> Tensor:
     """Denoise normals ``(N, 3, H, W)`` in [−1, 1] by themselves, with OIDN's weights for normals."""
     return _run(unet, [(normal, normal_to_unit)], lambda x: x.clamp(0, 1) * 2 - 1)
@@ -202,19 +221,35 @@ def normal_to_unit(normal: Tensor) -> Tensor:
 
 
 def _run(
-    unet: OidnUNet, layers: Sequence[tuple[Tensor, Callable[[Tensor], Tensor]]], decode: Callable[[Tensor], Tensor]
+    unet: OidnUNet,
+    layers: Sequence[tuple[Tensor, Callable[[Tensor], Tensor]]],
+    decode: Callable[[Tensor], Tensor],
+    borders: Borders = NO_BORDERS,
 ) -> Tensor:
     """Run the network on layers of any size, each mapped to [0, 1] by its function, and decode its output."""
-    height, width = layers[0][0].shape[2:]
-    right, below = -width % unet.multiple, -height % unet.multiple
+    device, (height, width) = layers[0][0].device, layers[0][0].shape[2:]
+    # Numbers of the rows and columns that the network sees.
+    rows, columns = (
+        torch.from_numpy(np.pad(np.arange(size), border, mode="reflect"))
+        for size, border in zip((height, width), borders, strict=True)
+    )
+    below, right = -len(rows) % unet.multiple, -len(columns) % unet.multiple
 
-    def encode(*rows: Tensor) -> list[Tensor]:
-        parts = [to_unit(layer) for layer, (_, to_unit) in zip(rows, layers, strict=True)]
+    def encode(numbers: Tensor) -> list[Tensor]:
+        parts = []
+        for layer, to_unit in layers:
+            part = layer.index_select(-2, numbers[:, 0].to(device))
+            if len(columns) > width:
+                part = part.index_select(-1, columns.to(device))
+            parts.append(to_unit(part))
         encoded = torch.cat(parts, 1)
         return [functional.pad(encoded, (0, right)) if right else encoded]  # padding by nothing copies
 
     # In strips, so that intermediate results are small and stay in the caches.
-    (x,) = in_strips(encode, 0, *(layer for layer, _ in layers))
-    image = cast(Tensor, unet(functional.pad(x, (0, 0, 0, below))))[..., :height, :width]
-    (result,) = in_strips(lambda rows: [decode(rows.float())], 0, image)
+    (x,) = in_strips(encode, 0, rows[:, None])
+    (top, _), (left, _) = borders
+    image = cast(Tensor, unet(functional.pad(x, (0, 0, 0, below)) if below else x))
+    (result,) = in_strips(
+        lambda rows: [decode(rows.float())], 0, image[..., top : top + height, left : left + width]
+    )
     return result

@@ -20,8 +20,7 @@ class PooledSamples(NamedTuple):
     """A frame with the samples of its neighbours."""
 
     average: Floats  # (H, W, 3) estimates weighted by confidence
-    image: Floats  # (H, W, 3) average + averaged residuals: unbiased, with the noise of `samples` frames
-    samples: Floats  # (H, W) frames' worth of samples, (Σ c)² / Σ c², 1 to T; 0 where no frame is trusted
+    image: Floats  # (H, W, 3) average + averaged residuals: unbiased, with the noise of (Σ c)² / Σ c² frames
 
 
 def pool_samples(estimates: Floats, residuals: Floats, confidence: Floats, exposure: float) -> PooledSamples:
@@ -45,7 +44,7 @@ def pool_samples(estimates: Floats, residuals: Floats, confidence: Floats, expos
     -----
     With e the estimates, r the residuals and c the confidence,
 
-        G = Σ c e / Σ c,    b = G + Σ c r' / Σ c,    N = (Σ c)² / Σ c²,
+        G = Σ c e / Σ c,    b = G + Σ c r' / Σ c,
 
     where r' is r scaled down to |r'| ≤ 6 (e + exposure), in the mean over channels, so that fireflies keep their hue
     and lose their power. `hybrid.alignment.residual` spreads that light around them beforehand, as far as it is missed.
@@ -55,9 +54,8 @@ def pool_samples(estimates: Floats, residuals: Floats, confidence: Floats, expos
     check_exposure(exposure)
     estimates, confidence = check_window(estimates, confidence, "confidence")
     residuals = np.ascontiguousarray(residuals, np.float32)
-    shape = estimates.shape[1:]
-    pooled = PooledSamples(*(np.empty(size, np.float32) for size in (shape, shape, shape[:2])))
-    run_bands(_pool, len(pooled.samples), estimates, residuals, confidence, np.float32(exposure), pooled)
+    pooled = PooledSamples(*(np.empty(estimates.shape[1:], np.float32) for _ in PooledSamples._fields))
+    run_bands(_pool, len(pooled.image), estimates, residuals, confidence, np.float32(exposure), pooled)
     return pooled
 
 
@@ -104,7 +102,7 @@ def _pool(
         for x in range(W):
             light[:] = 0
             noise[:] = 0
-            total, squares = 0.0, 0.0  # float64: the square of a small confidence must not vanish
+            total = np.float32(0)
             for t in range(T):
                 weight = confidence[t, y, x]
                 if not weight > 0:
@@ -118,11 +116,9 @@ def _pool(
                 limit = RESIDUAL_LIMIT * (max(level, np.float32(0)) + C * exposure)
                 share = min(limit / max(abs(excess), limit), np.float32(1))
                 total += weight
-                squares += np.float64(weight) ** 2
                 for c in range(C):
                     light[c] += weight * estimates[t, y, x, c]
                     noise[c] += weight * share * residuals[t, y, x, c]
-            pooled.samples[y, x] = total * total / squares if squares > 0 else 0
             for c in range(C):
                 if total > 0:
                     pooled.average[y, x, c] = light[c] / total

@@ -15,7 +15,7 @@ from hybrid.alignment.residual import Limited, warp_residual
 from hybrid.files.frame import Array
 from hybrid.files.passes import NO_PASSES, Passes
 from loops.parallel import Doubles, Mask
-from nlm.pooling import SampleRange, find_range
+from nlm.pooling import PooledSamples, SampleRange, find_range, pool_samples
 from nlm.samples import SampleMean
 from nlm.variance import prefilter_noisy_rows, smooth_variance, variance_from_window
 
@@ -122,10 +122,10 @@ class WarpSources:
             self.release()
         return residuals
 
-    def residual_strips(self) -> Iterator[tuple[int, Array]]:
+    def residual_strips(self, *, limited: bool = False) -> Iterator[tuple[int, Array]]:
         """Yield the residual strip by strip, with the first row of each: it is made for each use, and not kept."""
         for top in range(0, self.shape[0], STRIP):
-            yield top, self.residual(np.s_[top : top + STRIP, :])
+            yield top, self.residual(np.s_[top : top + STRIP, :], limited=limited)
 
 
 @dataclass(frozen=True)
@@ -216,6 +216,22 @@ class AlignedWindow:
         Made at each access.
         """
         return None if self.first_pass is None else self.sources.residual(limited=True)
+
+    def pool(self, weight: Array | None = None) -> PooledSamples:
+        """Average the samples of all frames at the centre, by weights (T, H, W) or the confidence; irradiance.
+
+        Raises ValueError without a first pass.
+        """
+        if self.first_pass is None:
+            raise ValueError("aligned: expected a window with estimates, got none")
+        weight = self.confidence if weight is None else weight
+        pooled = PooledSamples(*(np.empty_like(self.centre_irradiance) for _ in PooledSamples._fields))
+        for top, residual in self.sources.residual_strips(limited=True):
+            rows = slice(top, top + residual.shape[1])
+            strip = pool_samples(self.first_pass[:, rows], residual, weight[:, rows], self.exposure)
+            for whole, part in zip(pooled, strip, strict=True):
+                whole[rows] = part
+        return pooled
 
     @property
     def sample_range(self) -> SampleRange:

@@ -86,7 +86,7 @@ def denoise_bundled(
     color: Array, albedo: Array | None = None, normal: Array | None = None, *, quality: Quality = "high"
 ) -> Array:
     """Denoise one frame with the backbone of the `bundled_preset` of a quality, which needs only torch."""
-    # Missing guides are 0.5 to a backbone, as in `network.robust_unet.pack_inputs`; a normal of 0 is 0.5 to it.
+    # Missing guides are 0.5 to a backbone, as in `network.robust_unet.RobustUNet`; a normal of 0 is 0.5 to it.
     albedo = np.full_like(color, 0.5) if albedo is None else albedo
     normal = np.zeros_like(color) if normal is None else normal
     run = partial(denoise_color, exposure=_exposure(color))
@@ -128,5 +128,6 @@ def _run_tiled(run: Callable[..., Tensor], unet: OidnUNet, layers: list[Array]) 
     height, width = tensors[0].shape[2:]
     result = torch.empty_like(tensors[0])
     for inner, outer, offset in tiles(slice(0, height), height, width, TILE, HALO, unet.multiple):
-        result[..., *inner] = run(unet, *(layer[..., *outer] for layer in tensors))[..., *offset]
+        with torch.inference_mode():
+            result[..., *inner] = run(unet, *(layer[..., *outer] for layer in tensors))[..., *offset]
     return image_of(result)

@@ -1,7 +1,7 @@
 """Run the final stage on aligned windows: images from the frames' samples and first passes."""
 
 from functools import partial
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,12 +15,21 @@ from hybrid.neural.network_denoiser import NetworkDenoiser, Setup, Tile, exposur
 from hybrid.neural.oidn_networks import HALO, has_oidn_networks, prefilter_guides
 from hybrid.neural.tiling import Block, tensor_of
 from hybrid.stabilize import Denoised
-from network.robust_unet import MIRRORED, Borders, RobustUNet, denoise_window, for_inference
-from network.windows import UNetWindow
-from nlm.pooling import clamp_to_range
+from network.robust_average import UNetWindow, pool
+from network.robust_unet import MIRRORED, RobustUNet, for_inference
+from network.unet import Borders
+from nlm.pooling import PooledSamples, clamp_to_range
 
 # Bytes for each pixel of a tile in bfloat16, by the size of the backbone; measured.
 SCRATCH = {"small": 100, "base": 150, "large": 250}
+
+
+class _Inputs(NamedTuple):
+    """Layers of the centre that the network reads, and the weights of the frames."""
+
+    pooled: PooledSamples
+    guides: dict[str, Array]  # (H, W, 3)
+    weights: Array  # (T, H, W)
 
 
 class UNetDenoiser(NetworkDenoiser):
@@ -41,18 +50,30 @@ class UNetDenoiser(NetworkDenoiser):
     def __call__(self, aligned: AlignedWindow) -> Denoised:
         if aligned.first_pass is None or aligned.centre_first_pass is None:
             raise ValueError("estimate: expected those of the frames, as this network takes, got none")
+        with self.setup.timings.stage("pool"):
+            weights = self._weigh(aligned)
+            guides = clean_guides(aligned) if self.model.config.clean_guides else aligned.guides
+            inputs = _Inputs(aligned.pool(weights), guides, weights)
         with self.setup.timings.stage("network"):
             # `measure_exposure` returns 1 for an image without light, as far as numbers go.
             black = aligned.centre_first_pass.max() < 1 and measure_exposure(aligned.centre_first_pass) == 1
             nothing = np.empty((*aligned.centre_irradiance.shape[:2], 0), np.float32)
-            result = self._run(aligned, self._window(aligned), nothing, bool(black))
+            result = self._run(aligned, inputs, nothing, bool(black))
             limited = clamp_to_range(result.irradiance, aligned.sample_range)
             result = result._replace(irradiance=limited)
             filtered = filter_aovs(aligned, limited)
             shared = share_out(aligned, filtered, limited, add=self.setup.add_layers)
             return Denoised(shared.color, shared.aovs, self._count_parts(aligned, result), shared.parts)
 
-    def _run_tile(self, aligned: AlignedWindow, window: UNetWindow, outer: Block) -> Tile:
+    def _weigh(self, aligned: AlignedWindow) -> Array:
+        """Weights (T, H, W) of the frames, from the Robust Average block."""
+        if self.model.robust_average.is_prior:
+            return aligned.confidence
+        with torch.inference_mode():
+            weights = self.model.robust_average(self._window(aligned, np.s_[:, :]))
+        return np.ascontiguousarray(weights[0, :, 0].float().cpu().numpy())
+
+    def _run_tile(self, aligned: AlignedWindow, window: _Inputs, outer: Block) -> Tile:
         def border(part: slice, size: int) -> tuple[int, int]:
             before, after = MIRRORED * (part.start == 0), MIRRORED * (part.stop == size)
             return before, after + -(part.stop - part.start + before + after) % self.model.multiple
@@ -60,30 +81,38 @@ class UNetDenoiser(NetworkDenoiser):
         # Mirrored at the borders of the image, and up to the size that a U-Net needs.
         height, width = aligned.confidence.shape[1:]
         borders: Borders = border(outer[0], height), border(outer[1], width)
-        layers = {name: layer for name, layer in window._asdict().items() if layer is not None}
-        parts = {name: layer if layer.ndim == 1 else layer[..., *outer] for name, layer in layers.items()}
-        tile = window._replace(**{name: part.to(self.setup.torch_device) for name, part in parts.items()})
-        in_strips = partial(_residual_rows, aligned, outer) if window.residual is None else None
-        output = denoise_window(self.model, tile, borders=borders, residual=in_strips)
-        return Tile(output.irradiance, None, output.parts)
+        layers = (*window.pooled[::-1], aligned.modulation, *(window.guides.get(n) for n in ("albedo", "normal")))
+        image = self.model.denoise(*(self._cut(layer, outer) for layer in layers), gain_of(aligned), borders)
+        return Tile(image, None, partial(self._parts, aligned, window.weights, outer))
 
-    def _window(self, aligned: AlignedWindow) -> UNetWindow:
-        """The window as tensors that are views of its arrays."""
-        layers: Any = aligned.first_pass, aligned.confidence[..., None], aligned.modulation[None]
-        first_pass, confidence, modulation = (tensor_of(layer, copied=False) for layer in layers)
-        # On a processor the residual is made strip by strip; a breakdown reads the whole.
-        whole = None if self.setup.torch_device.type == "cpu" and self.setup.breakdown is None else aligned.residual
-        residual = None if whole is None else tensor_of(whole, copied=False)
-        guides = clean_guides(aligned) if self.model.config.clean_guides else aligned.guides
-        centre = {n: tensor_of(np.asarray(g, np.float32)[None], copied=False)[:, 0] for n, g in guides.items()}
-        gain, exposure = gain_of(aligned), exposure_of(aligned)
-        return UNetWindow(first_pass, residual, confidence, modulation[:, 0], exposure, gain, **centre)
+    def _parts(self, aligned: AlignedWindow, weights: Array, outer: Block) -> tuple[torch.Tensor, torch.Tensor]:
+        """Contribution and share of each frame within a tile, as `NetworkDenoiser` counts them."""
+        window = self._window(aligned, outer)
+        pooled = pool(window, self._cut_window(weights[..., None], outer))
+        return pooled.parts, pooled.share
 
+    def _window(self, aligned: AlignedWindow, outer: Block) -> UNetWindow:
+        """Part of a window as tensors."""
+        residual = aligned.sources.residual(outer, limited=True)
+        first_pass, confidence = (
+            self._cut_window(layer, outer) for layer in (aligned.first_pass, aligned.confidence[..., None])
+        )
+        return UNetWindow(
+            first_pass,
+            tensor_of(residual, copied=False).to(self.setup.torch_device),
+            confidence,
+            self._cut(aligned.modulation, outer),
+            exposure_of(aligned),
+            gain_of(aligned),
+        )
 
-def _residual_rows(aligned: AlignedWindow, outer: Block, rows: slice) -> Array:
-    """Rows of the residual within a tile, (T, h, w, 3)."""
-    top = outer[0].start
-    return aligned.sources.residual((slice(top + rows.start, top + rows.stop), outer[1]), limited=True)
+    def _cut_window(self, layer: Array, outer: Block) -> torch.Tensor:
+        return tensor_of(layer[:, *outer], copied=False).to(self.setup.torch_device)
+
+    def _cut(self, layer: Array | None, outer: Block) -> torch.Tensor | None:
+        if layer is None:
+            return None
+        return tensor_of(np.asarray(layer[*outer], np.float32)[None], copied=False)[:, 0].to(self.setup.torch_device)
 
 
 def clean_guides(aligned: AlignedWindow) -> dict[str, Array]:

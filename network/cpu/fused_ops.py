@@ -1,7 +1,5 @@
 """Operations on features at full resolution as one pass over memory, for inference on CPUs.
 
-- The Robust Average block with one weight per channel: torch makes some forty passes over the features of all frames,
-  which are far larger than any cache.
 - The last convolution, to three channels: torch computes sixteen channels, and takes three times as long.
 - The greatest of 2×2 features: torch also finds where each was, and takes ten times as long.
 - The input in bfloat16 with the low bits of its color: torch takes four times as long.
@@ -9,7 +7,6 @@
 Each pixel is read once and written once; bfloat16 is widened to float32 in between.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,35 +17,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from loops.parallel import Floats, run_bands
-
-_VALUES = 512  # processed together, about: the values of all frames fit the fastest cache
-_UNROLLED = (3, 5, 7)  # lengths of windows that `_blend` is written for
-
-
-def can_blend(x: Tensor, frames: int) -> bool:
-    """Whether `blend_channels` takes these features and this length of the window."""
-    supported = x.dtype in (torch.float32, torch.bfloat16) and frames in _UNROLLED
-    return supported and x.device.type == "cpu" and not torch.is_autocast_enabled("cpu")
-
-
-def blend_channels(
-    x: Tensor, frames: int, order: Sequence[int], weight: Tensor, returned: Sequence[int], common: Tensor | None = None
-) -> Tensor:
-    """Run a `network.robust_average.ChannelAverage` block on ``(T·N, C, H, W)``, time first, T 3, 5 or 7.
-
-    Frames are blended in the given order with the ``(C,)`` weight of the robust average; those in `returned` come back,
-    with `common` ``(N, C, H, W)`` added and then a ReLU.
-    """
-    pixels = x.to(memory_format=torch.channels_last).permute(0, 2, 3, 1).contiguous()
-    batch, (height, width, channels) = len(x) // frames, pixels.shape[1:]
-    result = pixels.new_empty(len(returned) * batch, height, width, channels)
-    added = pixels[:0] if common is None else common.permute(0, 2, 3, 1).contiguous()
-    lengths = frames, len(returned), int(common is not None)
-    layers = zip((pixels, result, added), lengths, strict=True)
-    rows = [_bits(values).reshape(n, batch * height, width * channels) for values, n in layers]
-    tiled = np.tile(weight.detach().float().numpy(), max(_VALUES // channels, 1))
-    run_bands(_blend, batch * height, *rows, np.asarray(order), np.asarray(returned), tiled)
-    return result.permute(0, 3, 1, 2)
 
 
 def can_project(x: Tensor) -> bool:
@@ -130,92 +98,6 @@ def _split(first: int, stop: int, source: Floats, bits: NDArray[np.uint32], resu
                 pair_bits[0] = np.uint32(result[y, x, c]) << np.uint32(16)
                 pair[1] = source[y, x, c] - pair[0]
                 result[y, x, channels + c] = _round(pair_bits[1])
-
-
-# Rows are separate arrays: the compiler vectorises loops only over arrays that it knows to be contiguous.
-@njit(nogil=True)
-def _widen(bits: Any, source: Any, low: Any) -> None:
-    for p in range(len(source)):
-        bits[p] = np.uint32(source[p]) << low
-
-
-@njit(nogil=True)
-def _narrow(result: Any, bits: Any, low: Any) -> None:
-    for p in range(len(result)):
-        value = bits[p]
-        if low:
-            value += np.uint32(0x7FFF) + ((value >> low) & np.uint32(1))  # ties to even
-        result[p] = value >> low
-
-
-@njit(nogil=True)
-def _blend_two(x: Any, a: Any, b: Any, share: Any) -> None:
-    for p in range(len(x)):
-        x[p] += share[p] * (np.float32(0.5) * (a[p] + b[p]) - x[p])
-
-
-@njit(nogil=True)
-def _blend_four(x: Any, a: Any, b: Any, c: Any, d: Any, share: Any) -> None:
-    for p in range(len(x)):
-        lower, upper = max(min(a[p], b[p]), min(c[p], d[p])), min(max(a[p], b[p]), max(c[p], d[p]))
-        x[p] += share[p] * (np.float32(0.5) * (lower + upper) - x[p])
-
-
-@njit(nogil=True)
-def _blend_six(x: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, share: Any) -> None:
-    for p in range(len(x)):
-        low, high = min(a[p], b[p]), max(a[p], b[p])
-        total = max(low, min(c[p], high))
-        low, high = min(low, c[p]), max(high, c[p])
-        total += max(low, min(d[p], high))
-        low, high = min(low, d[p]), max(high, d[p])
-        total += max(low, min(e[p], high))
-        low, high = min(low, e[p]), max(high, e[p])
-        total += max(low, min(f[p], high))
-        x[p] += share[p] * (np.float32(0.25) * total - x[p])
-
-
-@njit(nogil=True)
-def _add(x: Any, y: Any) -> None:
-    for p in range(len(x)):
-        x[p] = max(x[p] + y[p], np.float32(0))
-
-
-@njit(cache=True, nogil=True)
-def _blend(
-    first: int, stop: int, source: NDArray[Any], result: NDArray[Any], added: NDArray[Any], order: NDArray[Any],
-    returned: NDArray[Any], share: Floats,
-) -> None:  # fmt: skip
-    # Input and result are bits of float32, or of bfloat16, which is the upper half of a float32.
-    T, _, row = source.shape
-    low = np.uint32(32 - 8 * source.itemsize)
-    bits = np.zeros((T + 1, len(share)), np.uint32)
-    state = bits.view(np.float32)
-    others = np.empty((T, T - 1), np.intp)
-    for t in range(T):
-        for n in range(T - 1):
-            others[t, n] = n + (n >= t)
-    for y in range(first, stop):
-        for start in range(0, row, len(share)):
-            part = slice(start, min(start + len(share), row))
-            for t in range(T):
-                _widen(bits[t], source[t, y][part], low)
-            for i in order:
-                o = others[i]
-                if T == 3:
-                    _blend_two(state[i], state[o[0]], state[o[1]], share)
-                elif T == 5:
-                    _blend_four(state[i], state[o[0]], state[o[1]], state[o[2]], state[o[3]], share)
-                else:
-                    _blend_six(
-                        state[i], state[o[0]], state[o[1]], state[o[2]], state[o[3]], state[o[4]], state[o[5]], share
-                    )
-            if len(added):
-                _widen(bits[T], added[0, y][part], low)
-                for n in returned:
-                    _add(state[n], state[T])
-            for n in range(len(returned)):
-                _narrow(result[n, y][part], bits[returned[n]], low)
 
 
 # Transposes a row to planes of its channels, so that sums run over adjacent pixels, each in its own order.

@@ -5,7 +5,8 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from network.robust_average import outermost_first, ravg
+from network.paper.ravg import ravg
+from network.robust_average import outermost_first
 
 
 class ResidualBlock(nn.Module):

@@ -15,8 +15,7 @@ from torch.nn import functional
 from network.paper.blocks import ResidualBlock, RobustAverage, TemporalModule
 from network.paper.inputs import CHANNELS, KernelWindow, network_inputs
 from network.paper.kernels import Filtered, Pyramid, check_threshold, predict_kernel, softmax_kernel
-from network.robust_unet import channels_last
-from network.unet import check_size
+from network.unet import channels_last, check_size
 
 
 @dataclass(frozen=True)

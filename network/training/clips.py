@@ -458,20 +458,12 @@ class Samples(Dataset[Sample]):
         y, x = self._place(clips[0], rng)
         variation = _Variation.draw(rng, config.exposure_stops)
         samples = [self._varied(clip, y, x, variation) for clip in clips]
-        frames = len(clips[0].color)
-        if frames > 1 and rng.random() < config.drop_frames:
-            dropped = torch.from_numpy(rng.random(frames) < 0.5)
-            dropped[frames // 2] = False
-            for sample in samples:
-                for layer in (sample.color, sample.albedo, sample.normal, sample.estimate, sample.residual):
-                    layer[dropped] = layer[frames // 2].clone()
-                sample.confidence[dropped] = 0
         if rng.random() < config.fireflies:
             count = rng.integers(1, 9)
             rows, columns = rng.integers(config.crop, size=(2, count))
             # Not black where it was black: a firefly comes from a path, not from the pixel it lands in.
             burst = torch.from_numpy(10 ** rng.uniform(1, 3, count)).float() * clips[0].exposure.float()
-            frame = rng.integers(frames)
+            frame = rng.integers(len(clips[0].color))
             for layer in (samples[0].color, samples[0].residual):
                 layer[frame, :, rows, columns] += burst
         return Sample(*map(torch.stack, zip(*samples, strict=True))) if self.neighbours else samples[0]

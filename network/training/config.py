@@ -15,7 +15,6 @@ class SamplerConfig:
 
     crop: int = 128
     sets: int = 10
-    drop_frames: float = 0.1
     pseudo: float = 0.5
     fireflies: float = 0.1  # a few noisy pixels become 10 to 1000 times brighter
     exposure_stops: float = 1.0  # the exposure given to the network is off by up to this, either way
@@ -24,7 +23,7 @@ class SamplerConfig:
         for name in ("crop", "sets"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
-        for name in ("drop_frames", "fireflies", "pseudo"):
+        for name in ("fireflies", "pseudo"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name}: expected a probability, got {getattr(self, name)}")
 
@@ -37,7 +36,7 @@ class TrainConfig:
     minutes: float | None = None
     batch: int = 2
     rate: float = 1e-3
-    backbone_rate: float = 0.1
+    backbone_rate: float = 0.0
     # The kernels start at a reasonable mean, which a full rate at once would destroy.
     warmup: int = 200
     weight_decay: float = 1e-4

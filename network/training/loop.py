@@ -13,7 +13,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, cast
@@ -30,12 +30,13 @@ from network.paper.inputs import KernelWindow
 from network.paper.kernels import Filtered, mean_of
 from network.paper.models import filter_window
 from network.presets import Model
-from network.robust_unet import MIRRORED, RobustUNet, UNetOutput, channels_last, denoise_window
+from network.robust_average import UNetWindow
+from network.robust_unet import RobustUNet, UNetOutput
 from network.training import losses
 from network.training.clips import Clips, Sample, Samples, whole_frames
 from network.training.config import TrainConfig
 from network.training.perceptual import Perceptual, load_vgg19
-from network.windows import UNetWindow
+from network.unet import channels_last
 
 #: Share of the starting network's error from which on a crop counts, with `TrainConfig.against` "start": gains beyond
 #: 15 % of a crop would pay for losses in others.
@@ -64,7 +65,8 @@ def predict(
             batch.clean_albedo if clean else centre_of(batch.albedo),
             batch.clean_normal if clean else centre_of(batch.normal),
         )
-        return denoise_window(model, inputs, run, borders=((MIRRORED, MIRRORED),) * 2)
+        output: UNetOutput = (model if run is None else run)(inputs)
+        return output
 
 
 def centre_of(layers: Tensor) -> Tensor:
@@ -72,8 +74,15 @@ def centre_of(layers: Tensor) -> Tensor:
     return layers[:, layers.shape[1] // 2]
 
 
+def keep_frames(batch: Sample, frames: Sequence[int]) -> Sample:
+    """A batch in which only these frames of the window have any confidence."""
+    kept = torch.zeros_like(batch.confidence)
+    kept[:, list(frames)] = 1
+    return batch._replace(confidence=batch.confidence * kept)
+
+
 def loss_terms(config: TrainConfig, frames: int) -> list[losses.Term]:
-    """Terms of the loss of a network that predicts kernels of windows of so many frames; "temporal" by default."""
+    """Terms of the loss of a network with windows of so many frames; "temporal" by default."""
     if config.terms in (None, "temporal"):
         return losses.temporal_terms(frames, config.whole)
     return losses.power_terms(frames) if config.terms == "power" else losses.spatial_terms(frames)
@@ -121,12 +130,17 @@ def _crop_losses(
     """Loss (N,) of each crop over that of its clip's best input."""
     if neighbours := config.differences > 0:
         batch = Sample(*(pair.flatten(0, 1) for pair in batch))
-    output = predict(model, batch, not config.float32, run)
     color, facts = batch.color, (batch.target, batch.modulation, batch.exposure)
-    if isinstance(output, UNetOutput):
-        value = losses.image_loss(loss, output.irradiance, centre_of(color), *facts, config.slope)
+    terms = loss_terms(config, color.shape[1])
+    if isinstance(model, RobustUNet):
+        # An image of the U-Net is no sum of frames: the network runs once on each subset of the window.
+        value = torch.zeros_like(batch.error)
+        for subset, weight in terms:
+            output = predict(model, keep_frames(batch, subset), not config.float32, run)
+            value = value + weight * losses.image_loss(loss, output.irradiance, centre_of(color), *facts, config.slope)
+        value = value / sum(weight for _, weight in terms)
     else:
-        terms = loss_terms(config, color.shape[1])
+        output = predict(model, batch, not config.float32, run)
         value = losses.temporal_loss(loss, output, color, *facts, terms, config.slope)
     value = value / batch.error
     if neighbours:
@@ -196,8 +210,6 @@ def train(
         raise ValueError(
             f"crop: expected a multiple of {model.multiple}, as this model needs, got {config.sampler.crop}"
         )
-    if config.terms is not None and isinstance(model, RobustUNet):
-        raise ValueError(f"terms: expected none, as this model predicts no kernels, got {config.terms!r}")
     device = _device(config.device)
     state_path = Path(f"{os.fspath(out)}.state")
     channels_last(model.to(device).train())

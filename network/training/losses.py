@@ -152,11 +152,7 @@ def temporal_loss(
 def image_loss(
     loss: ImageLoss, image: Tensor, noisy: Tensor, target: Tensor, modulation: Tensor, scale: Tensor, slope: float = 1.0
 ) -> Tensor:
-    """Loss (N,) of the radiance of one image; parameters as for `temporal_loss`.
-
-    For networks whose images are no sums of their frames: instead of parts of the window they get windows of which
-    `SamplerConfig.drop_frames` drops frames.
-    """
+    """Loss (N,) of the radiance of one image; parameters as for `temporal_loss`."""
     radiance = image * modulation
     weights = None if slope == 1 else asymmetry(radiance, target, noisy * modulation, slope)
     return loss(radiance, target, scale_of_radiance(scale, modulation), weights)

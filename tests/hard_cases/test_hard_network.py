@@ -17,11 +17,11 @@ from network.checkpoint import load_model, shipped_weights  # noqa: E402
 from network.paper import models as paper  # noqa: E402
 from network.paper.inputs import KernelWindow  # noqa: E402
 from network.paper.kernels import apply_kernels, mean_of, predict_kernel, threshold_kernel  # noqa: E402
+from network.paper.ravg import ravg  # noqa: E402
 from network.presets import build_preset  # noqa: E402
-from network.robust_average import ravg  # noqa: E402
+from network.robust_average import UNetWindow  # noqa: E402
 from network.training import losses  # noqa: E402
 from network.training.perceptual import VGG19, Perceptual  # noqa: E402
-from network.windows import UNetWindow  # noqa: E402
 
 pytestmark = pytest.mark.neural
 EXAMPLES = 40
@@ -122,7 +122,7 @@ def run(model, window: dict[str, torch.Tensor]) -> torch.Tensor:
     """The irradiance of a window."""
     if isinstance(model, robust_unet.RobustUNet):
         names = ("estimate", "residual", "confidence", "modulation", "exposure", "gain")
-        return robust_unet.denoise_window(model, UNetWindow(*(window[name] for name in names))).irradiance
+        return model(UNetWindow(*(window[name] for name in names))).irradiance
     inputs = KernelWindow(window["color"], window["confidence"], window["exposure"])
     return paper.filter_window(model, inputs).irradiance
 

@@ -125,7 +125,6 @@ def test_wrong_metadata_is_named(tmp_path, metadata, word):
         {"widths": [-16, 32]},
         {"widths": []},
         {"widths": "wide"},
-        {"ra_scales": [7]},
         {"nonsense": 1},
         {"kernel": {"frames": 10**9 + 1}},
         {"kernel": {"size": 10**9 + 1}},
@@ -147,7 +146,7 @@ def test_hostile_sizes_are_refused_before_anything_is_built(tmp_path, changes):
 
 @pytest.mark.parametrize(
     "changes",
-    [{"widths": [2**40]}, {"frames": 10**9 + 1}, {"frames": 5.0}, {"ra_scales": [7]}, {"threshold": 2}],
+    [{"widths": [2**40]}, {"frames": 10**9 + 1}, {"frames": 5.0}, {"threshold": 2}],
     ids=str,
 )
 def test_hostile_sizes_beside_estimates_too(tmp_path, changes):

@@ -40,7 +40,7 @@ def make_model(seed: int = 0) -> RAUNet:
 
 def make_robust() -> RobustUNet:
     torch.manual_seed(0)
-    return RobustUNet(RobustUNetConfig(3, "small", (0, 1)))
+    return RobustUNet(RobustUNetConfig(3, "small"))
 
 
 SMALL = KernelConfig(frames=3, size=3)

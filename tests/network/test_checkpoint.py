@@ -18,7 +18,7 @@ torch = pytest.importorskip("torch")
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from network.checkpoint import _NAMES_OF_3, build, describe, load_model, save_model, shipped_weights
+from network.checkpoint import build, describe, load_model, save_model, shipped_weights
 from network.paper.models import RAResNet, RAResNetConfig
 from tests.network.small import MODELS, make_model, make_robust, notes_of
 
@@ -82,7 +82,7 @@ def test_files_that_are_no_weights_of_ours_are_an_error(tmp_path: Path) -> None:
         metadata, tensors = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     for change, message in [
         ({"format": "other"}, "expected format 'ravg-network', got 'other'"),
-        ({"version": "99"}, "expected version 4, got 99"),
+        ({"version": "99"}, "expected version 5, got 99"),
         ({"description": "{"}, "bad.safetensors"),
         ({"description": json.dumps(describe(RAResNet(RAResNetConfig(width=4))))}, "expected shape"),
     ]:
@@ -125,19 +125,22 @@ def test_weights_have_the_mode_that_the_umask_gives(tmp_path: Path, mask: int) -
     assert stat.S_IMODE((tmp_path / "w.safetensors").stat().st_mode) == 0o666 & ~mask
 
 
-def test_files_of_version_3_are_read_by_the_names_that_tensors_had(tmp_path: Path) -> None:
-    path, old, model = tmp_path / "w.safetensors", tmp_path / "old.safetensors", make_robust()
-    save_model(path, model)
-    with safe_open(path, framework="pt") as file:
-        metadata, tensors = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    names_of_3 = {today: then for then, today in _NAMES_OF_3.items()}
-    tensors = {names_of_3[name.split(".")[0]] + name[name.index(".") :]: value for name, value in tensors.items()}
-    save_file(tensors, old, {**metadata, "version": "3"})
-    for loaded, value in zip(load_model(old).parameters(), load_model(path).parameters(), strict=True):
-        assert torch.equal(loaded, value)
-    save_file(tensors, old, metadata)
-    with pytest.raises(ValueError, match="expected shape"):
-        load_model(old)
+@pytest.mark.parametrize("version", ["3", "4"])
+def test_older_files_of_the_papers_networks_are_read_and_those_of_the_final_stage_are_not(
+    tmp_path: Path, version: str
+) -> None:
+    for make, readable in ((make_model, True), (make_robust, False)):
+        path, old = tmp_path / "w.safetensors", tmp_path / "old.safetensors"
+        save_model(path, make())
+        with safe_open(path, framework="pt") as file:
+            metadata, tensors = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        save_file(tensors, old, {**metadata, "version": version})
+        if readable:
+            for loaded, value in zip(load_model(old).parameters(), load_model(path).parameters(), strict=True):
+                assert torch.equal(loaded, value)
+        else:
+            with pytest.raises(ValueError, match=f"expected version 5 of a RobustUNet, got {version}.*train it anew"):
+                load_model(old)
 
 
 def test_tkpcn_is_no_preset_any_more_and_its_weights_are_named() -> None:

@@ -1,84 +1,58 @@
-"""The robust average, and the block with a weight for each channel."""
+"""The Robust Average block on images."""
 
 # ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
 
-
-from network.robust_average import ChannelAverage, outermost_first, ravg
+from network.robust_average import MOST, RobustAverage, UNetWindow, outermost_first, pool
+from nlm import pooling
 
 pytestmark = pytest.mark.neural
 
 
-def random(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> torch.Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+def uniform(*shape: int, seed: int) -> torch.Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def ravg_by_sorting(frames: torch.Tensor) -> torch.Tensor:
-    """The equation, read literally: drop the smallest and the largest, average the rest."""
-    return frames.sort(0).values[1:-1].mean(0)
+def make_window(t: int = 5, h: int = 32, w: int = 48) -> UNetWindow:
+    """An image of waves under noise, in frames that are trusted here and there."""
+    y, x = torch.meshgrid(torch.linspace(0, 3, h), torch.linspace(0, 4, w), indexing="ij")
+    clean = (1.2 + torch.sin(2 * x + y) * torch.cos(3 * y))[None, None, None].expand(1, t, 3, h, w)
+    noisy = clean * -uniform(1, t, 3, h, w, seed=1).clamp_min(1e-3).log()  # exponential: skewed, mean 1
+    first_pass = clean * (1 + 0.02 * (uniform(1, t, 3, h, w, seed=3) - 0.5))
+    confidence = (uniform(1, t, 1, h, w, seed=2) + 0.2).clamp(max=1)
+    confidence[:, t // 2] = 1
+    guides = torch.full((1, 3, h, w), 0.5), torch.zeros(1, 3, h, w)
+    modulation, gain = torch.full((1, 3, h, w), 0.6), torch.full((1,), 0.3)
+    return UNetWindow(first_pass, noisy - first_pass, confidence, modulation, torch.ones(1), gain, *guides)
 
 
-@pytest.mark.parametrize("count", [3, 4, 5, 6, 7])
-def test_ravg_is_the_mean_without_minimum_and_maximum(count: int) -> None:
-    frames = random(count, 2, 3, 4, 5)
-    # Float64 sums of a few values of size 1: rounding only.
-    torch.testing.assert_close(ravg(frames.unbind(0)), ravg_by_sorting(frames), rtol=1e-12, atol=1e-12)
+def trained(bias: float | None = None) -> RobustAverage:
+    """A block whose correction is the same everywhere, or varies from pixel to pixel."""
+    torch.manual_seed(0)
+    block = RobustAverage().eval().requires_grad_(False)
+    if bias is None:
+        torch.nn.init.normal_(block.correction[-1].weight, std=0.5)
+    else:
+        block.correction[-1].bias.fill_(bias)
+    return block
 
 
-def test_ravg_of_one_and_two_frames() -> None:
-    a, b = random(2, 3, 4).unbind(0)
-    assert torch.equal(ravg([a]), a)
-    torch.testing.assert_close(ravg([a, b]), (a + b) / 2)
-
-
-def test_ravg_of_no_frame_is_an_error() -> None:
-    with pytest.raises(ValueError, match="frames: expected at least one"):
-        ravg([])
-
-
-@pytest.mark.parametrize("count", [3, 4, 5, 6])
-def test_ravg_does_not_depend_on_the_order(count: int) -> None:
-    frames = random(count, 50)
-    order = torch.randperm(count, generator=torch.Generator().manual_seed(1))
-    torch.testing.assert_close(ravg(frames[order].unbind(0)), ravg(frames.unbind(0)), rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("count", [3, 4, 5])
-@pytest.mark.parametrize("outlier", [1e6, -1e6])
-def test_ravg_in_bfloat16_is_not_harmed_by_an_outlier(count: int, outlier: float) -> None:
-    frames = torch.full((count, 8), 0.75, dtype=torch.bfloat16)
-    frames[1] = outlier
-    # 0.75 has an exact bfloat16; Σ − max − min would have lost it beside 1e6, whose bfloat16 spacing is 4096.
-    assert torch.equal(ravg(frames.unbind(0)), torch.full((8,), 0.75, dtype=torch.bfloat16))
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 6])
-def test_ravg_gradient(count: int) -> None:
-    frames = [f.clone().requires_grad_() for f in random(count, 4, 3, seed=2).unbind(0)]
-    assert torch.autograd.gradcheck(lambda *x: ravg(x), frames)
-
-
-@pytest.mark.parametrize("count", [3, 4, 5, 6])
-def test_ravg_gradient_of_equal_values_is_a_subgradient(count: int) -> None:
-    """Adding the same to all frames adds it to the mean, so the gradients sum to 1 even where values tie."""
-    values = torch.tensor([[0.0, 1.0, 0.0, 2.0], [0.0, 1.0, 1.0, 2.0], [0.0, 0.0, 1.0, 1.0]], dtype=torch.float64)
-    frames = [values[i % 3].clone().requires_grad_() for i in range(count)]
-    gradients = torch.stack(torch.autograd.grad(ravg(frames).sum(), frames))
-    torch.testing.assert_close(gradients.sum(0), torch.ones(4, dtype=torch.float64))
-    assert bool((gradients >= 0).all())
-
-
-def test_ravg_works_where_only_some_frames_need_a_gradient() -> None:
-    frames = list(random(4, 6).unbind(0))
-    frames[2] = frames[2].clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(ravg(frames).sum(), frames[2])
-    middle = torch.stack(frames).argsort(0).argsort(0)[2]  # its rank among the four
-    assert torch.equal(gradient, torch.where((middle == 1) | (middle == 2), 0.5, 0.0).double())
+def recursion(window: UNetWindow, corrections: dict[int, torch.Tensor]) -> torch.Tensor:
+    """The recursion of the docstring, literally, on the frames' images of the centre."""
+    images = pool(window, window.confidence).parts * window.confidence.sum(1, keepdim=True) / window.confidence
+    order = outermost_first(images.shape[1])
+    x, total = images[:, order[0]], window.confidence[:, order[0]]
+    for s in order[1:]:
+        own = window.confidence[:, s]
+        w = torch.sigmoid((total / own).log() + corrections[s])
+        x, total = (1 - w) * images[:, s] + w * x, own + total * corrections[s].exp()
+    return x
 
 
 def test_the_outermost_frames_come_first_and_the_centre_last() -> None:
@@ -87,25 +61,85 @@ def test_the_outermost_frames_come_first_and_the_centre_last() -> None:
     assert outermost_first(1) == [0]
 
 
-@pytest.mark.parametrize("count", [2, 3, 5, 7])
-def test_channel_average_against_the_naive_one(count: int) -> None:
-    block = ChannelAverage(4, 0.8).double()
-    torch.nn.init.uniform_(block.blend, -2, 2)
-    frames = random(count, 2, 4, 6, 5, seed=3)
-    expected, weight = list(frames.unbind(0)), block.blend.sigmoid()[:, None, None]
-    for i in outermost_first(count):
-        others = torch.stack([f for j, f in enumerate(expected) if j != i])
-        average = ravg_by_sorting(others) if len(others) > 2 else others.mean(0)
-        expected[i] = (1 - weight) * expected[i] + weight * average
-    torch.testing.assert_close(block(frames.flatten(0, 1), count), torch.cat(expected))
+def test_with_f_0_it_is_the_mean_by_confidence() -> None:
+    """With and without gradients; and as pooled in one pass over memory, with a firefly that is limited in both."""
+    window, block = make_window(), RobustAverage()
+    window.residual[0, 1, :, 4, 4] = 1e4
+    weights = block(window)  # computed, as in training
+    torch.testing.assert_close(weights, window.confidence)
+    with torch.no_grad():
+        assert block(window) is window.confidence
+    pooled = pool(window, weights.detach())
+    frames, residuals = (layer[0].permute(0, 2, 3, 1).numpy() for layer in window[:2])
+    expected = pooling.pool_samples(frames, residuals, window.confidence[0, :, 0].numpy(), 1.0)
+    for found, wanted in ((pooled.image, expected.image), (pooled.average, expected.average)):
+        np.testing.assert_allclose(found[0].permute(1, 2, 0).numpy(), wanted, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(pooled.parts.sum(1), pooled.image)
+    torch.testing.assert_close(pooled.share.sum(1), torch.ones_like(pooled.share[:, 0]))
 
 
-def test_channel_average_begins_where_it_is_told_to_and_learns() -> None:
-    block = ChannelAverage(3, 0.8).double()
-    torch.testing.assert_close(block.blend.sigmoid(), torch.full((3,), 0.8).double())
-    x = random(5, 3, 3, 4, seed=4).requires_grad_()
+@pytest.mark.parametrize("frames", [1, 3, 5, 7])
+def test_weights_give_the_result_of_the_recursion(frames: int) -> None:
+    """With corrections of each step that differ."""
+    window, block, seen = make_window(frames), trained(), {}
+    order = iter(outermost_first(frames)[1:])
+    correct = block._correct
 
-    def run(x: torch.Tensor, blend: torch.Tensor) -> torch.Tensor:
-        return torch.func.functional_call(block, {"blend": blend}, (x, 5))
+    def keep(features: torch.Tensor) -> torch.Tensor:
+        f = correct(features)
+        seen[next(order)] = f
+        return f
 
-    assert torch.autograd.gradcheck(run, (x, block.blend))
+    block._correct = keep  # type: ignore[method-assign]
+    image = pool(window, block(window)).image
+    torch.testing.assert_close(image, recursion(window, seen), rtol=1e-4, atol=1e-5)
+    plain = pool(window, window.confidence).image
+    assert (frames == 1) == bool(torch.equal(image, plain))
+    assert all(float(f.abs().max()) <= MOST for f in seen.values())
+
+
+def test_a_correction_takes_the_centre_or_the_others() -> None:
+    """f of −4 at every step leaves the later frame, the centre at last; f of 4 the frames that were visited first."""
+    window = make_window()._replace(confidence=torch.ones(1, 5, 1, 32, 48))
+    least, most = (pool(window, trained(bias)(window)).share.mean((0, 2, 3, 4)) for bias in (-1e6, 1e6))
+    assert float(least[2]) > 0.97
+    assert float(most[2]) < 0.01
+    assert float(most[0] + most[4]) > 0.97
+
+
+@pytest.mark.parametrize("bias", [None, 3.0, -3.0])
+def test_neighbours_of_no_confidence_leave_the_single_frame(bias: float | None) -> None:
+    window, block = make_window(), trained(bias)
+    window.confidence[:, [0, 1, 3, 4]] = 0
+    pooled = pool(window, block(window))
+    centre = pool(window._replace(confidence=torch.ones(1, 5, 1, 32, 48)), torch.eye(5)[2].view(1, 5, 1, 1, 1))
+    torch.testing.assert_close(pooled.image, centre.image)
+    torch.testing.assert_close(pooled.average, window.first_pass[:, 2])
+
+
+def test_where_no_frame_is_trusted_the_first_pass_of_the_centre_is() -> None:
+    window = make_window()
+    window.confidence[:] = 0
+    for block in (RobustAverage(), trained()):
+        pooled = pool(window, block(window))
+        torch.testing.assert_close(pooled.image, window.first_pass[:, 2])
+        torch.testing.assert_close(pooled.average, window.first_pass[:, 2])
+
+
+@pytest.mark.parametrize("scale", [2**-14, 2**14])
+def test_weights_do_not_depend_on_the_unit_of_light(scale: float) -> None:
+    window, block = make_window(), trained()
+    light = {name: getattr(window, name) * scale for name in ("first_pass", "residual", "exposure")}
+    other = window._replace(**light, gain=window.gain / scale)
+    torch.testing.assert_close(block(other), block(window))
+
+
+def test_gradients_reach_the_correction_and_are_finite() -> None:
+    window, block = make_window(), RobustAverage()
+    window.confidence[:, 0] = 0
+    window.residual[0, 2, :, 3, 3] = 1e6
+    image = pool(window, block(window)).image
+    (image - window.first_pass[:, 2]).square().mean().backward()
+    last = block.correction[-1]
+    assert float(last.weight.grad.abs().max()) > 0
+    assert all(bool(torch.isfinite(value.grad).all()) for value in block.parameters())

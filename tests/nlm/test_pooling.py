@@ -20,8 +20,8 @@ def window() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def plain_gather(e: np.ndarray, r: np.ndarray, c: np.ndarray, exposure: float) -> list[np.ndarray]:
     """The definition, pixel by pixel, in float64."""
-    average, image, samples = np.zeros(e.shape[1:]), np.zeros(e.shape[1:]), np.zeros(e.shape[1:3])
-    for y, x in np.ndindex(samples.shape):
+    average, image = np.zeros(e.shape[1:]), np.zeros(e.shape[1:])
+    for y, x in np.ndindex(e.shape[1:3]):
         light, noise, weights = np.zeros(3), np.zeros(3), []
         for t in range(len(e)):
             if c[t, y, x] > 0 and np.isfinite([e[t, y, x], r[t, y, x]]).all():
@@ -31,10 +31,9 @@ def plain_gather(e: np.ndarray, r: np.ndarray, c: np.ndarray, exposure: float) -
                 noise += weights[-1] * r[t, y, x] * min(1, limit / max(abs(r[t, y, x].mean()), 1e-30))
         if weights:
             average[y, x], image[y, x] = light / sum(weights), (light + noise) / sum(weights)
-            samples[y, x] = sum(weights) ** 2 / sum(np.square(weights))
         else:
             average[y, x] = image[y, x] = e[len(e) // 2, y, x]
-    return [average, image, samples]
+    return [average, image]
 
 
 def test_gather_is_its_definition(window) -> None:
@@ -45,7 +44,7 @@ def test_gather_is_its_definition(window) -> None:
     confidence[2, 8, 8] = np.nan
     gathered = pool_samples(*window, exposure=0.4)
     expected = plain_gather(*window, exposure=0.4)
-    for found, wanted in zip((gathered.average, gathered.image, gathered.samples), expected, strict=True):
+    for found, wanted in zip(gathered, expected, strict=True):
         np.testing.assert_allclose(found, wanted, rtol=2e-5, atol=1e-6)  # sums of five float32
 
 
@@ -65,7 +64,6 @@ def test_a_scaled_window_is_gathered_to_a_scaled_one(window, scale: float) -> No
     scaled = pool_samples(scale * estimates, scale * residuals, confidence, scale * 0.4)
     np.testing.assert_array_equal(scaled.average, scale * plain.average)
     np.testing.assert_array_equal(scaled.image, scale * plain.image)
-    np.testing.assert_array_equal(scaled.samples, plain.samples)
 
 
 def test_equal_trust_brings_the_noise_of_as_many_frames() -> None:
@@ -73,23 +71,10 @@ def test_equal_trust_brings_the_noise_of_as_many_frames() -> None:
     estimates = np.ones((5, 60, 60, 3), np.float32)
     residuals = rng.normal(0, 0.3, estimates.shape).astype(np.float32)
     gathered = pool_samples(estimates, residuals, np.ones((5, 60, 60), np.float32), 1.0)
-    np.testing.assert_allclose(gathered.samples, 5, rtol=1e-6)
     # 10800 samples: the variance is known to 1.4 %, four deviations are 5.5 %.
     assert gathered.image.var() == pytest.approx(0.3**2 / 5, rel=0.055)
     # Unbiased: the mean of 54000 samples, four deviations.
     assert gathered.image.mean() == pytest.approx(1, abs=4 * 0.3 / np.sqrt(54000))
-
-
-def test_samples_lie_between_one_frame_and_all(window) -> None:
-    estimates, residuals, confidence = window
-    samples = pool_samples(estimates, residuals, confidence, 1.0).samples
-    np.testing.assert_array_equal(samples[2], 0)
-    np.testing.assert_allclose(samples[3], 1, rtol=1e-6)
-    rest = np.delete(samples, [2, 3], axis=0)
-    assert rest.min() > 1
-    assert rest.max() <= 5
-    # However little a frame is trusted, it is a frame.
-    np.testing.assert_allclose(pool_samples(estimates, residuals, 1e-30 * confidence, 1.0).samples, samples, rtol=1e-5)
 
 
 def test_without_trust_the_centre_is_left(window) -> None:
@@ -97,7 +82,6 @@ def test_without_trust_the_centre_is_left(window) -> None:
     gathered = pool_samples(estimates, residuals, np.zeros_like(confidence), 1.0)
     np.testing.assert_array_equal(gathered.average, estimates[2])
     np.testing.assert_array_equal(gathered.image, estimates[2])
-    np.testing.assert_array_equal(gathered.samples, 0)
 
 
 def test_a_frame_that_nobody_trusts_may_hold_anything(window) -> None:
@@ -107,7 +91,7 @@ def test_a_frame_that_nobody_trusts_may_hold_anything(window) -> None:
     for value in (np.nan, np.inf, 1e30):
         estimates[4] = residuals[4] = value
         again = pool_samples(estimates, residuals, confidence, 1.0)
-        for name in ("average", "image", "samples"):
+        for name in ("average", "image"):
             np.testing.assert_array_equal(getattr(again, name), getattr(plain, name))
 
 

@@ -270,8 +270,8 @@ OPTIONS = {
     "seed": (["--seed", 5], 5),
     "validate_minutes": (["--validate-minutes", 3], 3.0),
     "sampler": (
-        ["--crop", 64, "--sets", 4, "--drop-frames", 0.3, "--pseudo", 0.25],
-        SamplerConfig(crop=64, sets=4, drop_frames=0.3, pseudo=0.25),
+        ["--crop", 64, "--sets", 4, "--pseudo", 0.25],
+        SamplerConfig(crop=64, sets=4, pseudo=0.25),
     ),
 }
 NOT_OFFERED = {"weight_decay"}

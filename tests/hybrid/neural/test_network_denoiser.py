@@ -15,7 +15,6 @@ from hybrid.stream import FrameStream  # noqa: E402
 from hybrid.validation import validate_layers  # noqa: E402
 from network.checkpoint import save_model, shipped_weights  # noqa: E402
 from network.presets import build_preset  # noqa: E402
-from nlm.pooling import pool_samples  # noqa: E402
 
 pytestmark = pytest.mark.neural
 
@@ -177,8 +176,7 @@ def test_contributions_sum_to_what_is_made_of_them_and_weights_to_one(folder, we
     assert list(denoised.extra) == [*added, "stage.align", "stage.gate", "stage.network"]
     parts, whole = sum(denoised.extra[f"contribution.{name}"] for name in names), denoised.color
     if weights.stem == "fast":  # whose pictures are made of what the frames give together
-        gathered = pool_samples(window.first_pass, window.residual, window.confidence, window.exposure)
-        whole = gathered.image * window.modulation
+        whole = window.pool().image * window.modulation
     np.testing.assert_allclose(parts, whole, rtol=1e-4, atol=1e-5)  # of mean_of's epsilon, 1e-6
     shares = np.stack([denoised.extra[f"weight.{name}"] for name in names])
     np.testing.assert_allclose(shares.sum(0), 1, rtol=1e-5)

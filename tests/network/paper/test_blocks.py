@@ -11,7 +11,8 @@ torch = pytest.importorskip("torch")
 from torch.nn import functional
 
 from network.paper.blocks import ResidualBlock, RobustAverage, TemporalModule
-from network.robust_average import outermost_first, ravg
+from network.paper.ravg import ravg
+from network.robust_average import outermost_first
 
 pytestmark = pytest.mark.neural
 

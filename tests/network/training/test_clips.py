@@ -36,7 +36,7 @@ from network.training.config import SamplerConfig
 pytestmark = pytest.mark.neural
 
 #: Nothing random but the clip, the level, the target and the orientation.
-PLAIN = SamplerConfig(crop=16, sets=1, drop_frames=0, fireflies=0, exposure_stops=0)
+PLAIN = SamplerConfig(crop=16, sets=1, fireflies=0, exposure_stops=0)
 SPP = (8, 8, 2)
 
 
@@ -371,14 +371,6 @@ def test_crops_of_larger_clips_are_drawn_by_importance(tmp_path: Path) -> None:
 
 def test_variations_do_what_they_say(tmp_path: Path) -> None:
     clips = folder_of(tmp_path, {"a": 2})
-    dropped = [Samples(clips, replace(PLAIN, drop_frames=1), 0)[number] for number in range(20)]
-    assert any(bool((sample.confidence[0] == 0).all()) for sample in dropped)
-    for sample in dropped:
-        for frame in range(3):
-            if not bool(sample.confidence[frame].any()):
-                for name in ("color", "albedo", "normal", "estimate"):
-                    assert torch.equal(getattr(sample, name)[frame], getattr(sample, name)[1])
-        assert bool(sample.confidence[1].any())  # never the centre
     bright = Samples(clips, replace(PLAIN, fireflies=1), 0)[0].color
     assert float(bright.max()) > 2  # without, below 1.1 / 2
     away = [float(Samples(clips, replace(PLAIN, exposure_stops=2), 0)[n].exposure) for n in range(20)]

@@ -21,7 +21,8 @@ torch = pytest.importorskip("torch")
 import network.training.loop
 from network.checkpoint import load_model
 from network.presets import Model
-from network.robust_unet import MIRRORED, RobustUNet, RobustUNetConfig
+from network.robust_average import UNetWindow
+from network.robust_unet import RobustUNet, RobustUNetConfig, UNetOutput
 from network.training import losses
 from network.training.clips import Clip, Clips, Sample, Samples, open_clips, split_by_shot, whole_frames, write_shards
 from network.training.config import LOSSES, TERMS, SamplerConfig, TrainConfig
@@ -101,28 +102,13 @@ def test_a_network_that_relies_on_its_guides_is_trained_with_those_without_noise
     batch, seen = a_batch(clips, CONFIG, 2), []
     model = RobustUNet(RobustUNetConfig(3, "small", clean_guides=clean))
 
-    def spy(frames: torch.Tensor, shared: torch.Tensor, static: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        seen.append(static)
-        return model(frames, shared, static)
+    def spy(window: UNetWindow) -> UNetOutput:
+        seen.append(window)
+        return model(window)
 
     predict(model, batch, run=spy)
     wanted = batch.clean_albedo if clean else batch.albedo[:, 1]  # ones and zeros
-    torch.testing.assert_close(seen[0][:, 3:6, MIRRORED:-MIRRORED, MIRRORED:-MIRRORED], wanted)
-
-
-def test_crops_are_mirrored_in_training_as_frames_are_in_running(clips: Clips) -> None:
-    """Without, a third of a crop of 80 pixels is spoilt by the darkness that a trunk sees beyond its borders."""
-    batch, model, seen = a_batch(clips, CONFIG, 1), make_robust(), []
-
-    def spy(frames: torch.Tensor, shared: torch.Tensor, static: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        seen.append(shared)
-        return model(frames, shared, static)
-
-    picture = predict(model, batch, run=spy)
-    assert picture.irradiance.shape == batch.target.shape
-    assert seen[0].shape[-2:] == (16 + 2 * MIRRORED,) * 2
-    inner = seen[0][..., MIRRORED : MIRRORED + 5, :]
-    torch.testing.assert_close(seen[0][..., MIRRORED - 4 : MIRRORED + 1, :].flip(-2), inner)
+    torch.testing.assert_close(seen[0].albedo, wanted)
 
 
 def test_differences_of_neighbours_count_along_the_motion(tmp_path: Path) -> None:
@@ -138,7 +124,7 @@ def test_differences_of_neighbours_count_along_the_motion(tmp_path: Path) -> Non
         pair = [replace(clip, reference=target, linked=torch.ones(2)) for target in targets]
         pair[1] = replace(pair[1], linked=torch.zeros(2))
         write_shards(folder, "s", (4, 4), pair)
-        sampler = replace(config.sampler, fireflies=0, drop_frames=0, exposure_stops=0)
+        sampler = replace(config.sampler, fireflies=0, exposure_stops=0)
         samples = Samples(open_clips(folder), sampler, 0, image_loss(config), neighbours=True)
         batch = torch.utils.data.default_collate([samples[0]])
         plain = Sample(*(pair.flatten(0, 1) for pair in batch))
@@ -153,7 +139,7 @@ def test_differences_of_neighbours_count_along_the_motion(tmp_path: Path) -> Non
 
 
 def one_batch(clips: Clips, **fixed: float) -> Sample:
-    sampler = replace(CONFIG.sampler, fireflies=0, drop_frames=0, **fixed)
+    sampler = replace(CONFIG.sampler, fireflies=0, **fixed)
     return torch.utils.data.default_collate([Samples(clips, sampler, 7)[0]])
 
 
@@ -231,7 +217,7 @@ def test_a_training_against_its_start_begins_at_the_loss_of_no_gain(
 ) -> None:
     """Both networks compute alike, in bfloat16 too."""
     monkeypatch.setattr("network.training.loop.has_bfloat16", lambda device: True)
-    config = replace(AGAINST_START, steps=3, float32=float32)
+    config = replace(AGAINST_START, steps=3, float32=float32, backbone_rate=1.0)
     values = train(sets[0], sets[0].of([]), make_robust(), config, tmp_path / "w.safetensors")
     assert values[0] == pytest.approx(0.15**2, rel=1e-5)
     assert values[2] != pytest.approx(0.15**2, rel=1e-3)  # the start stays as it was
@@ -294,7 +280,7 @@ def test_a_pretrained_backbone_is_trained_with_its_share_of_the_rate(
 ) -> None:
     """The first step of Adam moves each weight by the learning rate."""
     model = make_robust()
-    torch.nn.init.normal_(model.average_blend.weight)
+    torch.nn.init.normal_(model.robust_average.correction[-1].weight)
     torch.nn.init.constant_(model.backbone.last.bias, 0.5)
     before = {name: value.detach().clone() for name, value in model.named_parameters()}
     train(sets[0], sets[0].of([]), model, replace(CONFIG, steps=1, backbone_rate=share), tmp_path / "w.safetensors")
@@ -380,10 +366,10 @@ def test_every_model_learns_with_all_of_its_weights(
 ) -> None:
     model = MODELS[name]()
     if isinstance(model, RobustUNet):  # as after some steps: what starts as a constant hides what is before it
-        torch.nn.init.normal_(model.average_blend.weight)
+        torch.nn.init.normal_(model.robust_average.correction[-1].weight)
         torch.nn.init.constant_(model.backbone.last.bias, 0.5)  # else by chance all is black, without gradients
     before = [p.clone() for p in model.parameters()]
-    config = replace(CONFIG, steps=2, terms=None if isinstance(model, RobustUNet) else terms, slope=2.0)
+    config = replace(CONFIG, steps=2, terms=terms, slope=2.0, backbone_rate=1.0)
     losses = train(sets[0], sets[0].of([]), model, config, tmp_path / "w.safetensors")
     assert np.isfinite(losses).all()
     assert all(not torch.equal(p, q) for p, q in zip(model.parameters(), before, strict=True))

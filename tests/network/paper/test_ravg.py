@@ -1,0 +1,80 @@
+"""The robust average of the paper."""
+
+# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
+
+from __future__ import annotations
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from network.paper.ravg import ravg
+
+pytestmark = pytest.mark.neural
+
+
+def random(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+def ravg_by_sorting(frames: torch.Tensor) -> torch.Tensor:
+    """The equation, read literally: drop the smallest and the largest, average the rest."""
+    return frames.sort(0).values[1:-1].mean(0)
+
+
+@pytest.mark.parametrize("count", [3, 4, 5, 6, 7])
+def test_ravg_is_the_mean_without_minimum_and_maximum(count: int) -> None:
+    frames = random(count, 2, 3, 4, 5)
+    # Float64 sums of a few values of size 1: rounding only.
+    torch.testing.assert_close(ravg(frames.unbind(0)), ravg_by_sorting(frames), rtol=1e-12, atol=1e-12)
+
+
+def test_ravg_of_one_and_two_frames() -> None:
+    a, b = random(2, 3, 4).unbind(0)
+    assert torch.equal(ravg([a]), a)
+    torch.testing.assert_close(ravg([a, b]), (a + b) / 2)
+
+
+def test_ravg_of_no_frame_is_an_error() -> None:
+    with pytest.raises(ValueError, match="frames: expected at least one"):
+        ravg([])
+
+
+@pytest.mark.parametrize("count", [3, 4, 5, 6])
+def test_ravg_does_not_depend_on_the_order(count: int) -> None:
+    frames = random(count, 50)
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(ravg(frames[order].unbind(0)), ravg(frames.unbind(0)), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [3, 4, 5])
+@pytest.mark.parametrize("outlier", [1e6, -1e6])
+def test_ravg_in_bfloat16_is_not_harmed_by_an_outlier(count: int, outlier: float) -> None:
+    frames = torch.full((count, 8), 0.75, dtype=torch.bfloat16)
+    frames[1] = outlier
+    # 0.75 has an exact bfloat16; Σ − max − min would have lost it beside 1e6, whose bfloat16 spacing is 4096.
+    assert torch.equal(ravg(frames.unbind(0)), torch.full((8,), 0.75, dtype=torch.bfloat16))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 6])
+def test_ravg_gradient(count: int) -> None:
+    frames = [f.clone().requires_grad_() for f in random(count, 4, 3, seed=2).unbind(0)]
+    assert torch.autograd.gradcheck(lambda *x: ravg(x), frames)
+
+
+@pytest.mark.parametrize("count", [3, 4, 5, 6])
+def test_ravg_gradient_of_equal_values_is_a_subgradient(count: int) -> None:
+    """Adding the same to all frames adds it to the mean, so the gradients sum to 1 even where values tie."""
+    values = torch.tensor([[0.0, 1.0, 0.0, 2.0], [0.0, 1.0, 1.0, 2.0], [0.0, 0.0, 1.0, 1.0]], dtype=torch.float64)
+    frames = [values[i % 3].clone().requires_grad_() for i in range(count)]
+    gradients = torch.stack(torch.autograd.grad(ravg(frames).sum(), frames))
+    torch.testing.assert_close(gradients.sum(0), torch.ones(4, dtype=torch.float64))
+    assert bool((gradients >= 0).all())
+
+
+def test_ravg_works_where_only_some_frames_need_a_gradient() -> None:
+    frames = list(random(4, 6).unbind(0))
+    frames[2] = frames[2].clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(ravg(frames).sum(), frames[2])
+    middle = torch.stack(frames).argsort(0).argsort(0)[2]  # its rank among the four
+    assert torch.equal(gradient, torch.where((middle == 1) | (middle == 2), 0.5, 0.0).double())
