@@ -47,7 +47,7 @@ def network(folder: Path, frames: int) -> list[str]:
     from network.checkpoint import load_model, save_model, shipped_weights
     from network.robust_unet import RobustUNet, RobustUNetConfig
 
-    shipped = load_model(shipped_weights("fast"))
+    shipped = load_model(shipped_weights("balanced"))
     model = RobustUNet(RobustUNetConfig(frames, shipped.config.size))
     model.load_state_dict(shipped.state_dict())
     save_model(folder / f"{frames}.safetensors", model)
@@ -89,7 +89,7 @@ def serial_share(command: Callable[[], dict[str, float]], out: Path, pairs: int)
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("over", choices=("pixels", "frames", "window", "jobs", "cores"))
-    parser.add_argument("--preset", default="fast")
+    parser.add_argument("--preset", default="balanced")
     parser.add_argument("--frames", type=int, default=5, help="of each run, but over frames (default: 5)")
     parser.add_argument("--scale", type=int, default=6, help="of 320×180, for window and cores (default: 6)")
     parser.add_argument("--values", type=int, nargs="+", help="scales, frames, windows or jobs, in place of all")

@@ -16,7 +16,7 @@ class WindowDenoiser(Protocol):
     """A denoiser of aligned windows. Callers use nothing else, and never ask for the class."""
 
     needs_first_pass: ClassVar[bool] = True  # whether windows must hold a first pass
-    clamps: ClassVar[bool] = False  # whether results are clamped to `AlignedWindow.sample_range`
+    clamps: bool = False  # whether results are clamped to `AlignedWindow.sample_range`
     guided: bool = True  # whether `AlignedWindow.guide` or its confidence by geometry is read where there are no AOVs
     pools: ClassVar[bool] = False  # whether samples of the window are pooled and denoised by OIDN
     packages: ClassVar[tuple[str, ...]] = ()  # packages that pixels depend on

@@ -35,7 +35,7 @@ from hybrid.memory import MemoryPlan, parse_size, plan_memory
 from hybrid.oidn import find_device
 from hybrid.option_texts import option_texts
 from hybrid.pipeline import Failed, Finished, RunSettings, View, denoise_frames, sources_of, temporal_support
-from hybrid.plan import NEURAL_STAGES, Rules
+from hybrid.plan import LEFT_OUT, NEURAL_STAGES, Rules
 from hybrid.preview import check_png
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, FINAL
 from hybrid.runtime.allocator import reuse_freed_memory
@@ -48,7 +48,7 @@ LOG = logging.getLogger("ravg")
 
 # Presets of each method, the default first.
 PRESETS: dict[str, tuple[str, ...]] = {
-    "network": (*NETWORKS, "auto"),
+    "network": ("balanced", "fast", "quality", "auto"),
     "classical": ("standard", "draft", "final"),
     "pooled": ("pooled",),
 }
@@ -185,9 +185,10 @@ class DenoiseOptions:
 
     @property
     def rules(self) -> Rules:
-        """The forced stages; those that only a network has are off without one."""
-        off = frozenset(self.no_stages) | (frozenset() if self.method == "network" else NEURAL_STAGES)
-        return Rules(frozenset(self.stages), off)
+        """The forced stages. Off are also those of networks without one, and those that the preset leaves out."""
+        off = frozenset() if self.method == "network" else NEURAL_STAGES
+        off |= LEFT_OUT.get(self.preset, frozenset()) if self.weights is None else frozenset()
+        return Rules(frozenset(self.stages), frozenset(self.no_stages) | (off - frozenset(self.stages)))
 
     @property
     def weights_file(self) -> Path | None:
@@ -377,14 +378,14 @@ def _check_views(views: Sequence[Shot], report: ValidationReport, options: Denoi
 def _fit_budget(view: Shot, options: DenoiseOptions) -> DenoiseOptions:
     """The options with the most accurate preset that is measured to fit the budget, or with the fastest."""
 
-    def load(preset: str) -> tuple[WindowDenoiser, FirstPassSource]:
+    def load(preset: str) -> tuple[Rules, WindowDenoiser, FirstPassSource]:
         # Nothing is kept: the frames that are measured are parts.
         measured = replace(options, preset=preset, budget=None, keep_first_pass=None)
         denoiser = open_denoiser(measured)
-        return denoiser, choose_first_pass(view, measured, denoiser)
+        return measured.rules, denoiser, choose_first_pass(view, measured, denoiser)
 
     limit, tried = parse_budget(str(options.budget)), []
-    for measured in measure_presets(view, options.rules, MEASURED, load):
+    for measured in measure_presets(view, MEASURED, load):
         tried.append(f"{measured.preset} {measured.seconds:.2g} s")
         fits = measured.seconds <= limit
         if fits:
@@ -484,8 +485,7 @@ class Job:
         weights = {} if options.weights_file is None else {"weights": _digest(options.weights_file)}
         if first_pass.name == "bundled":
             neural = import_neural()
-            bundled = neural.bundled_preset(OIDN_MODES[options.oidn_mode]["quality"])
-            weights["bundled"] = _digest(neural.shipped_weights(bundled))
+            weights["bundled"] = _digest(neural.shipped_weights(neural.BUNDLED))
         return {
             "method": options.method,
             "aovs": list(self.views[0].aovs),

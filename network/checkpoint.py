@@ -138,16 +138,16 @@ def load_model(path: str | os.PathLike[str]) -> Model:
         try:
             if len(text := metadata["description"]) > LONGEST:
                 raise ValueError(f"description: expected at most {LONGEST} characters, got {len(text)}")
-            description = json.loads(text)
+            description, old = json.loads(text), metadata["version"] != str(VERSION)
             _refuse_huge(description)
-            if description["model"] == "RobustUNet" and metadata["version"] != str(VERSION):
+            if isinstance(description, dict) and description.get("model") == "RobustUNet" and old:
                 raise ValueError(
                     f"expected version {VERSION} of a RobustUNet, got {metadata['version']}, which averages features; "
                     "train it anew (ravg train --init oidn)"
                 )
             with torch.device("meta"):  # shapes alone, which take no memory
                 expected = {name: tuple(value.shape) for name, value in build(description).state_dict().items()}
-        except (KeyError, TypeError, ValueError, RecursionError) as error:
+        except (KeyError, ValueError, RecursionError) as error:
             raise ValueError(f"{where}: {_short(error)}") from error
         found = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118 (no mapping)
         if expected != found:

@@ -24,8 +24,8 @@ def _multiscale(frames: int) -> paper.MultiScale:
 
 
 PRESETS: dict[str, Preset] = {
-    # The final stage with OIDN's small, base and large U-Net: 0.3, 0.9 and 3.9 M parameters.
-    "fast": Preset(lambda frames: RobustUNet(RobustUNetConfig(frames, "small"))),
+    # The final stage without a U-Net, and with OIDN's base and large one: 0.9 and 3.9 M parameters.
+    "fast": Preset(lambda frames: RobustUNet(RobustUNetConfig(frames, "none"))),
     "balanced": Preset(lambda frames: RobustUNet(RobustUNetConfig(frames, "base"))),
     "quality": Preset(lambda frames: RobustUNet(RobustUNetConfig(frames, "large", clean_guides=True)), frames=7),
     # From noisy frames alone: a small U-Net of 0.24 M parameters; a four-scale U-Net with RA blocks at every scale and

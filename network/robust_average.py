@@ -156,4 +156,3 @@ def _encode(irradiance: Tensor, scale: Tensor) -> Tensor:
 def _box(image: Tensor, size: int) -> Tensor:
     """Box mean, of the pixels within the image."""
     return functional.avg_pool2d(image, size, 1, size // 2, count_include_pad=False) if size > 1 else image
-

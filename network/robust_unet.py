@@ -25,14 +25,14 @@ MIRRORED = 16
 @dataclass(frozen=True)
 class RobustUNetConfig:
     frames: int = 5  # T, odd; the window
-    size: str = "base"  # of network.unet.ENCODERS
+    size: str = "base"  # of network.unet.ENCODERS, or "none": the average of the first passes is the image
     clean_guides: bool = False  # whether the backbone relies on its guides: noisy guides are filtered first
 
     def __post_init__(self) -> None:
         if self.frames < 1 or self.frames % 2 == 0:
             raise ValueError(f"frames: expected an odd number >= 1, got {self.frames}")
-        if self.size not in ENCODERS:
-            raise ValueError(f"size: expected one of {', '.join(ENCODERS)}, got {self.size!r}")
+        if self.size not in (sizes := ("none", *ENCODERS)):
+            raise ValueError(f"size: expected one of {', '.join(sizes)}, got {self.size!r}")
 
 
 @dataclass(frozen=True)
@@ -51,20 +51,21 @@ class RobustUNet(nn.Module):
     """A Robust Average block, whose result OIDN's U-Net denoises.
 
     The image is ``(1 − k) O(b) + k G``, with b the pooled image, O the U-Net, G the average of the first passes and k
-    the `AVERAGE_BLEND`: the errors of two images that are made differently cancel in part, and G flickers less. There
-    are 4,000 parameters beside the backbone's 0.32 M ("small"), 0.92 M ("base") or 3.85 M ("large").
+    the `AVERAGE_BLEND`: the errors of two images that are made differently cancel in part, and G flickers less. Without
+    a U-Net it is G. There are 4,000 parameters beside the backbone's 0.32 M ("small"), 0.92 M ("base") or 3.85 M
+    ("large").
     """
 
     def __init__(self, config: RobustUNetConfig) -> None:
         super().__init__()
         self.config = config
         self.robust_average = RobustAverage()
-        self.backbone = OidnUNet(OidnUNetConfig(9, config.size))
+        self.backbone = None if config.size == "none" else OidnUNet(OidnUNetConfig(9, config.size))
 
     @property
     def multiple(self) -> int:
         """Height and width with borders must be multiples of this."""
-        return self.backbone.multiple
+        return 1 if self.backbone is None else self.backbone.multiple
 
     @property
     def frames(self) -> int:
@@ -95,6 +96,8 @@ class RobustUNet(nn.Module):
 
         `borders` are the pixels by which layers are mirrored beyond their borders.
         """
+        if self.backbone is None:
+            return average.clamp_min(0)
         # Missing guides are 0.5 to a backbone; a normal of 0 is 0.5 to it.
         albedo = torch.full_like(modulation, 0.5) if albedo is None else albedo
         normal = torch.zeros_like(modulation) if normal is None else normal
@@ -105,13 +108,14 @@ class RobustUNet(nn.Module):
 
 def start_from_oidn(model: RobustUNet) -> RobustUNet:
     """Load the weights of OIDN's network of its size into a model (`network.oidn_weights.load_oidn`); returns it."""
-    model.backbone.load_state_dict(load_oidn(OIDN_BACKBONES[model.config.size]).state_dict())
+    if model.backbone is not None:
+        model.backbone.load_state_dict(load_oidn(OIDN_BACKBONES[model.config.size]).state_dict())
     return model
 
 
 def for_inference(model: RobustUNet, bfloat16: bool) -> RobustUNet:
     """Prepare a model for running, in place: without gradients, the backbone in `bfloat16` (`round_unet`) or not."""
     model.eval().requires_grad_(False)
-    if bfloat16:
+    if bfloat16 and model.backbone is not None:
         model.backbone = round_unet(model.backbone)
     return channels_last(model)

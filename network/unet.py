@@ -249,7 +249,5 @@ def _run(
     (x,) = in_strips(encode, 0, rows[:, None])
     (top, _), (left, _) = borders
     image = cast(Tensor, unet(functional.pad(x, (0, 0, 0, below)) if below else x))
-    (result,) = in_strips(
-        lambda rows: [decode(rows.float())], 0, image[..., top : top + height, left : left + width]
-    )
+    (result,) = in_strips(lambda rows: [decode(rows.float())], 0, image[..., top : top + height, left : left + width])
     return result

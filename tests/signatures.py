@@ -1,4 +1,4 @@
-"""The loops that a run of `fast` has called: ``python -m tests.signatures`` writes `hybrid.runtime.signatures.FILE`."""
+"""The loops that a run of `balanced` has called: ``python -m tests.signatures`` writes `hybrid.runtime.signatures.FILE`."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def called_loops(folder: Path) -> list[tuple[str, Any]]:
     subprocess.run(words, check=True, capture_output=True)
     called: dict[str, list[Any]] = {}
     for index, shot in enumerate((ROOT / "examples" / "shot" / "noisy.####.exr", folder / "busy" / "busy.####.exr")):
-        words = ["denoise", str(shot), "-o", str(folder / f"out{index}"), "--preset", "fast"]
+        words = ["denoise", str(shot), "-o", str(folder / f"out{index}"), "--preset", "balanced"]
         words = [sys.executable, "-c", RUN, " ".join(PACKAGES), *words]
         done = subprocess.run(words, cwd=ROOT, check=True, capture_output=True, text=True)
         for line in done.stdout.splitlines():

@@ -162,7 +162,7 @@ def parse_samples(text: str) -> dict[str, float]:
 def train(
     clips: Path,
     output: Path,
-    preset: str = "fast",
+    preset: str = "balanced",
     init: str | None = None,
     window: int | None = None,
     validation: list[str] | None = None,

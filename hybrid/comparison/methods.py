@@ -21,7 +21,7 @@ from hybrid.first_pass import (
     read_denoised,
 )
 from hybrid.oidn import Quality
-from hybrid.plan import Rules
+from hybrid.plan import LEFT_OUT, Rules
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window, gated_average, pool_and_denoise
 from hybrid.stabilize import FrameDenoiser
 from hybrid.stream import FrameStream
@@ -206,7 +206,8 @@ def _aligned(family: str, denoise: WindowFilter, source: str = "none", **setting
 
 
 def _network(preset: str, source: str) -> Method:
-    run = Network(preset, WindowSettings(source=source))
+    rules = Rules(off=LEFT_OUT.get(preset, frozenset()))
+    run = Network(preset, WindowSettings(source=source, rules=rules))
     return Method(run, "Networks", run.maps, settings={"weights": preset, "first pass": source})
 
 

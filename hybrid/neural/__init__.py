@@ -1,7 +1,7 @@
 """The boundary to torch: running networks, making clips, training. Importing it needs torch."""
 
 from hybrid.neural.clips import ClipSource, write_clips
-from hybrid.neural.oidn_networks import bundled_preset, denoise_bundled
+from hybrid.neural.oidn_networks import BUNDLED, denoise_bundled
 from hybrid.neural.opening import open_network
 from hybrid.neural.train import TrainInputs, train_network
 from network.checkpoint import find_weights, shipped_weights
@@ -9,6 +9,6 @@ from network.paper import TKPCN_WEIGHTS
 from network.presets import PRESETS as TRAINING_PRESETS
 
 __all__ = [
-    "TKPCN_WEIGHTS", "TRAINING_PRESETS", "ClipSource", "TrainInputs", "bundled_preset", "denoise_bundled",
+    "BUNDLED", "TKPCN_WEIGHTS", "TRAINING_PRESETS", "ClipSource", "TrainInputs", "denoise_bundled",
     "find_weights", "open_network", "shipped_weights", "train_network", "write_clips",
 ]  # fmt: skip

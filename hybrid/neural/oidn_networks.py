@@ -22,6 +22,7 @@ from network.oidn_weights import load_oidn
 from network.robust_unet import RobustUNet
 from network.unet import OidnUNet, denoise_albedo, denoise_color, denoise_normal
 
+BUNDLED = "balanced"  # the preset whose backbone replaces OIDN where OIDN is not installed
 HALO = 112  # pixels of context around a tile: nothing farther away changes more than the last bits of an image
 SCRATCH = 210  # bytes for each pixel of a tile in bfloat16; measured in float32, with the free memory between blocks
 TILE = 2048  # side of a tile, so that memory does not grow with the frame: 1920×1080 is one, 3840×2160 are four
@@ -77,20 +78,15 @@ def prefilter_guides(guides: Mapping[str, Array], quality: Quality = "balanced")
     }
 
 
-def bundled_preset(quality: Quality) -> str:
-    """The preset whose backbone replaces OIDN of this quality where OIDN is not installed."""
-    return "fast" if quality == "fast" else "balanced"
-
-
 def denoise_bundled(
     color: Array, albedo: Array | None = None, normal: Array | None = None, *, quality: Quality = "high"
 ) -> Array:
-    """Denoise one frame with the backbone of the `bundled_preset` of a quality, which needs only torch."""
+    """Denoise one frame with the backbone of `BUNDLED`, which needs only torch and is of every quality."""
     # Missing guides are 0.5 to a backbone, as in `network.robust_unet.RobustUNet`; a normal of 0 is 0.5 to it.
     albedo = np.full_like(color, 0.5) if albedo is None else albedo
     normal = np.zeros_like(color) if normal is None else normal
     run = partial(denoise_color, exposure=_exposure(color))
-    return _run_tiled(run, _bundled(bundled_preset(quality)), [color, albedo, normal])
+    return _run_tiled(run, _bundled(), [color, albedo, normal])
 
 
 def has_oidn_networks() -> bool:
@@ -108,8 +104,9 @@ def _network(name: str) -> OidnUNet:
 
 
 @lru_cache
-def _bundled(preset: str) -> OidnUNet:
-    return _for_inference(cast(RobustUNet, load_model(shipped_weights(preset))).backbone)
+def _bundled() -> OidnUNet:
+    backbone = cast(RobustUNet, load_model(shipped_weights(BUNDLED))).backbone
+    return _for_inference(cast(OidnUNet, backbone))
 
 
 def _for_inference(unet: OidnUNet) -> OidnUNet:

@@ -18,10 +18,11 @@ from hybrid.stabilize import Denoised
 from network.robust_average import UNetWindow, pool
 from network.robust_unet import MIRRORED, RobustUNet, for_inference
 from network.unet import Borders
+from nlm.average import average
 from nlm.pooling import PooledSamples, clamp_to_range
 
 # Bytes for each pixel of a tile in bfloat16, by the size of the backbone; measured.
-SCRATCH = {"small": 100, "base": 150, "large": 250}
+SCRATCH = {"none": 0, "small": 100, "base": 150, "large": 250}
 
 
 class _Inputs(NamedTuple):
@@ -35,12 +36,13 @@ class _Inputs(NamedTuple):
 class UNetDenoiser(NetworkDenoiser):
     """Runs a `network.robust_unet.RobustUNet` on aligned windows that have a first pass; from `open_network`."""
 
-    needs_first_pass = clamps = True
+    needs_first_pass = True
     halo = HALO
     default_tile = 2048  # 1920×1080 is one tile
 
     def __init__(self, model: RobustUNet, setup: Setup) -> None:
         super().__init__(for_inference(model, setup.bfloat16), setup, SCRATCH[model.config.size])
+        self.clamps = model.backbone is not None  # an average is within the range of what it averages
         self.guided = setup.breakdown is not None or (model.config.clean_guides and not has_oidn_networks())
 
     @property
@@ -53,16 +55,16 @@ class UNetDenoiser(NetworkDenoiser):
         with self.setup.timings.stage("pool"):
             weights = self._weigh(aligned)
             guides = clean_guides(aligned) if self.model.config.clean_guides else aligned.guides
-            inputs = _Inputs(aligned.pool(weights), guides, weights)
+            inputs = _Inputs(self._pool(aligned, weights), guides, weights)
         with self.setup.timings.stage("network"):
             # `measure_exposure` returns 1 for an image without light, as far as numbers go.
             black = aligned.centre_first_pass.max() < 1 and measure_exposure(aligned.centre_first_pass) == 1
             nothing = np.empty((*aligned.centre_irradiance.shape[:2], 0), np.float32)
             result = self._run(aligned, inputs, nothing, bool(black))
-            limited = clamp_to_range(result.irradiance, aligned.sample_range)
-            result = result._replace(irradiance=limited)
-            filtered = filter_aovs(aligned, limited)
-            shared = share_out(aligned, filtered, limited, add=self.setup.add_layers)
+            if self.clamps:
+                result = result._replace(irradiance=clamp_to_range(result.irradiance, aligned.sample_range))
+            filtered = filter_aovs(aligned, result.irradiance)
+            shared = share_out(aligned, filtered, result.irradiance, add=self.setup.add_layers)
             return Denoised(shared.color, shared.aovs, self._count_parts(aligned, result), shared.parts)
 
     def _weigh(self, aligned: AlignedWindow) -> Array:
@@ -72,6 +74,14 @@ class UNetDenoiser(NetworkDenoiser):
         with torch.inference_mode():
             weights = self.model.robust_average(self._window(aligned, np.s_[:, :]))
         return np.ascontiguousarray(weights[0, :, 0].float().cpu().numpy())
+
+    def _pool(self, aligned: AlignedWindow, weights: Array) -> PooledSamples:
+        """The pooled samples; without a U-Net the average of the first passes, which is the image then."""
+        if self.model.backbone is not None:
+            return aligned.pool(weights)
+        assert aligned.first_pass is not None
+        mean = average(aligned.first_pass, weights)
+        return PooledSamples(mean, mean)
 
     def _run_tile(self, aligned: AlignedWindow, window: _Inputs, outer: Block) -> Tile:
         def border(part: slice, size: int) -> tuple[int, int]:
@@ -88,6 +98,8 @@ class UNetDenoiser(NetworkDenoiser):
     def _parts(self, aligned: AlignedWindow, weights: Array, outer: Block) -> tuple[torch.Tensor, torch.Tensor]:
         """Contribution and share of each frame within a tile, as `NetworkDenoiser` counts them."""
         window = self._window(aligned, outer)
+        if self.model.backbone is None:
+            window = window._replace(residual=torch.zeros_like(window.residual))
         pooled = pool(window, self._cut_window(weights[..., None], outer))
         return pooled.parts, pooled.share
 

@@ -1,4 +1,4 @@
-"""Signatures of the loops that `fast` calls, so that they can be compiled before they are called.
+"""Signatures of the loops that `balanced` calls, so that they can be compiled before they are called.
 
 `signatures.json` maps the name of each loop to the types of its arguments; ``python -m tests.signatures`` writes it.
 """

@@ -294,9 +294,10 @@ def _groups(model: Model, backbone_rate: float) -> list[dict[str, Any]]:
         return [{"params": list(model.parameters()), "share": 1.0}]
     new = [value for name, value in model.named_parameters() if not name.startswith("backbone.")]
     # Frozen parameters need no gradient.
-    model.backbone.requires_grad_(backbone_rate > 0)
-    pretrained = {"params": list(model.backbone.parameters()), "share": backbone_rate}
-    return [{"params": new, "share": 1.0}, *([pretrained] if backbone_rate else [])]
+    backbone = nn.Module() if model.backbone is None else model.backbone
+    backbone.requires_grad_(backbone_rate > 0)
+    pretrained = {"params": list(backbone.parameters()), "share": backbone_rate}
+    return [{"params": new, "share": 1.0}, *([pretrained] if backbone_rate and pretrained["params"] else [])]
 
 
 def _in_group() -> bool:

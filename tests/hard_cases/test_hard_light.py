@@ -32,7 +32,7 @@ def network():
     from hybrid.neural import open_network
     from network.checkpoint import shipped_weights
 
-    return {p: open_network(shipped_weights("fast"), precision=p) for p in ("float32", "bfloat16")}
+    return {p: open_network(shipped_weights("balanced"), precision=p) for p in ("float32", "bfloat16")}
 
 
 @pytest.mark.parametrize("preset", CLASSICAL_PRESETS)
@@ -57,7 +57,7 @@ def test_the_network_scales_with_the_light(network, record_property):
 @pytest.mark.neural
 @pytest.mark.filterwarnings("error")  # the guides are read-only
 @pytest.mark.parametrize(
-    ("options", "factor"), [({"preset": "final"}, 1.5), ({"preset": "fast", "first_pass": "bundled"}, 4)], ids=str
+    ("options", "factor"), [({"preset": "final"}, 1.5), ({"preset": "balanced", "first_pass": "bundled"}, 4)], ids=str
 )
 def test_a_bright_window_lets_no_noise_into_the_room(options, factor):
     """Errors of the room were measured against the mean with the window, and samples blended in for 2 to 6 dB."""
@@ -81,7 +81,7 @@ def test_a_bright_window_lets_no_noise_into_the_room(options, factor):
 
 
 @pytest.mark.neural
-@pytest.mark.parametrize("options", [{"preset": "final"}, {"preset": "fast", "first_pass": "bundled"}], ids=str)
+@pytest.mark.parametrize("options", [{"preset": "final"}, {"preset": "balanced", "first_pass": "bundled"}], ids=str)
 def test_frames_beside_a_black_one_scale_with_the_light(options):
     """Pairs with a black frame were compared by an exposure of 1, and networks leave a little light on black."""
     pytest.importorskip("torch")

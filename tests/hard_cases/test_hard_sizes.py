@@ -44,7 +44,7 @@ def test_the_network_takes_any_size(size):
     from hybrid.neural import open_network
     from network.checkpoint import shipped_weights
 
-    image = open_network(shipped_weights("fast"))(align(noisy(size), first_pass=PerFrame(itself))).color
+    image = open_network(shipped_weights("balanced"))(align(noisy(size), first_pass=PerFrame(itself))).color
     assert image.shape == (*size, 3)
     assert np.isfinite(image).all()
 
@@ -59,7 +59,7 @@ def test_first_passes_of_any_size_keep_the_light(size, source):
     pytest.importorskip("torch")
     frames = [{"color": frame.color, "albedo": frame.albedo, "normal": frame.normal} for frame in noisy(size, 9)]
     light = np.mean([frame["color"] for frame in frames])
-    results = [result.layers["color"] for result in denoise_arrays(frames, preset="fast", first_pass=source)]
+    results = [result.layers["color"] for result in denoise_arrays(frames, preset="balanced", first_pass=source)]
     assert np.mean(results) == pytest.approx(light, rel=0.05)
 
 
@@ -86,7 +86,7 @@ def test_more_than_32767_pixels_through_the_network():
     from network.checkpoint import shipped_weights
 
     window = align(noisy((3, 33_000), 3), number=1, first_pass=PerFrame(itself))
-    image = open_network(shipped_weights("fast"))(window).color
+    image = open_network(shipped_weights("balanced"))(window).color
     assert image.shape == (3, 33_000, 3)
     assert np.isfinite(image).all()
 
@@ -112,7 +112,7 @@ def test_tiles_of_any_size_give_the_same_picture(precision, tolerance):
     window = align(noisy((height, width)), first_pass=PerFrame(itself))
 
     def denoiser(tile):
-        return open_network(shipped_weights("fast"), tile=tile, precision=precision)
+        return open_network(shipped_weights("balanced"), tile=tile, precision=precision)
 
     whole = denoiser(width)(window).color
     for tile in (32, 64, 100):

@@ -31,13 +31,13 @@ pytestmark = pytest.mark.neural
 @pytest.fixture(scope="module")
 def good(tmp_path_factory):
     path = tmp_path_factory.mktemp("weights") / "good.safetensors"
-    save_model(path, build_preset("fast"))
+    save_model(path, build_preset("balanced"))
     return path.read_bytes()
 
 
 def write(path, model=None, **metadata):
     """A file with the tensors of a model and any metadata; None leaves an entry out."""
-    model = model or build_preset("fast")
+    model = model or build_preset("balanced")
     entries = {
         "format": "ravg-network",
         "version": str(VERSION),
@@ -150,7 +150,7 @@ def test_hostile_sizes_are_refused_before_anything_is_built(tmp_path, changes):
     ids=str,
 )
 def test_hostile_sizes_beside_estimates_too(tmp_path, changes):
-    described = describe(build_preset("fast"))
+    described = describe(build_preset("balanced"))
     described["config"] |= changes
     with pytest.raises(ValueError, match="weights"):
         load_model(write(tmp_path / "x.safetensors", description=json.dumps(described)))
@@ -181,7 +181,7 @@ def test_descriptions_that_nest_are_refused_before_anything_is_built(tmp_path, d
         ("paper", {"conv_size": 99}, "conv_size: expected a number up to 15, got 99"),
         ("paper", {"blocks": 255}, "blocks: expected a number up to 64"),
         ("paper", {"width": 10**400}, "width: expected a number up to 256, got 1000"),
-        ("fast", {"frames": 255}, "frames: expected a number up to 15, got 255"),
+        ("balanced", {"frames": 255}, "frames: expected a number up to 15, got 255"),
         ("unet", {"widths": [256] * 250}, "expected shape|widths"),
         ("unet", {"kernel": {"frames": 5, "size": 255, "threshold": 0.5, "activation": "relu"}}, "size: expected"),
     ],
@@ -208,9 +208,9 @@ def test_a_message_quotes_no_more_than_a_line(tmp_path, capsys, entry):
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 6e4, -6e4])
 def test_weights_that_are_not_finite_or_absurd_are_refused(tmp_path, value):
     """They made every picture NaN."""
-    model = build_preset("fast")
+    model = build_preset("balanced")
     with torch.no_grad():
-        model.aux_conv.weight[0, 0, 0, 0] = value
+        model.backbone.last.weight[0, 0, 0, 0] = value
     with pytest.raises(ValueError, match="finite"):
         load_model(write(tmp_path / "x.safetensors", model))
 
@@ -218,7 +218,7 @@ def test_weights_that_are_not_finite_or_absurd_are_refused(tmp_path, value):
 def test_the_command_says_it_in_one_line_and_writes_nothing(tmp_path, capsys):
     folder = Scene(frames=1).write(tmp_path / "in")
     bad = tmp_path / "bad.safetensors"
-    bad.write_bytes(shipped_weights("fast").read_bytes()[:1000])
+    bad.write_bytes(shipped_weights("balanced").read_bytes()[:1000])
     assert main(["denoise", str(folder), "-o", str(tmp_path / "out"), "--weights", str(bad)]) == 1
     lines = capsys.readouterr().err.strip().splitlines()
     assert lines[-1].startswith("error: weights")

@@ -62,9 +62,9 @@ def test_presets_are_measured_in_turn(tmp_path, monkeypatch, estimate):
     source = find_first_pass(str(folder) if estimate == "sequence" else estimate, shot)
 
     def load(preset):
-        return Fake(lambda window: seen.append((preset, window.number))), source
+        return Rules(), Fake(lambda window: seen.append((preset, window.number))), source
 
-    measured = list(measure_presets(shot, Rules(), MEASURED, load))
+    measured = list(measure_presets(shot, MEASURED, load))
     assert [m.preset for m in measured] == ["quality", "balanced", "fast"]
     assert all(m.seconds > 0 for m in measured)
     # Two frames in the middle, and those beside them, whose pictures they are averaged with.
@@ -75,7 +75,8 @@ def test_of_two_frames_that_are_all_both_count(tmp_path):
     shot = open_shot(replace(SCENE, frames=2).write(tmp_path))
     source = find_first_pass("nlm", shot)
     # Both pictures are made for the first frame; the second alone would have cost next to nothing.
-    measured = measure_presets(shot, Rules(), MEASURED, lambda _: (Fake(lambda window: time.sleep(0.2)), source))
+    slow = Rules(), Fake(lambda window: time.sleep(0.2)), source
+    measured = measure_presets(shot, MEASURED, lambda _: slow)
     assert all(m.seconds >= 0.2 for m in measured)
 
 
@@ -113,4 +114,4 @@ def test_a_budget_and_a_preset_are_not_both_chosen(tmp_path):
 
 def test_a_budget_alone_chooses_the_preset():
     assert DenoiseOptions(budget="9s").preset == "auto"
-    assert DenoiseOptions().preset == "fast"
+    assert DenoiseOptions().preset == "balanced"

@@ -44,7 +44,7 @@ def test_without_a_network_it_is_the_command(shot_folder, tmp_path, preset, esti
 def test_with_a_network_it_is_the_command(shot_folder, tmp_path):
     pytest.importorskip("torch")
     shot = hybrid.open_shot(shot_folder)
-    assert len(list(hybrid.denoise_shot(shot, tmp_path / "made", preset="fast", first_pass="nlm"))) == 3
+    assert len(list(hybrid.denoise_shot(shot, tmp_path / "made", preset="balanced", first_pass="nlm"))) == 3
     assert main(["denoise", str(shot_folder), "-o", str(tmp_path / "out"), "--first-pass", "nlm"]) == 0
     same(tmp_path / "made", tmp_path / "out")
 
@@ -195,7 +195,7 @@ def test_a_callback_or_closing_ends_the_work_after_a_frame(tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"preset": "best"}, "expected one of fast, balanced"),
+        ({"preset": "best"}, "expected one of balanced, fast"),
         ({"method": "magic"}, "expected one of network, classical, pooled"),
         ({"method": "classical", "preset": "fast"}, "expected one of standard, draft, final with method classical"),
         ({"preset": "auto"}, "budget chooses the preset"),
@@ -250,7 +250,7 @@ def test_presets_and_methods_belong_together():
         "pooled",
         "pooled",
     ]
-    assert [DenoiseOptions(method=name).preset for name in PRESETS] == ["fast", "standard", "pooled"]
+    assert [DenoiseOptions(method=name).preset for name in PRESETS] == ["balanced", "standard", "pooled"]
     assert [DenoiseOptions(method=name).first_pass for name in PRESETS] == ["auto", "none", "oidn-fast"]
 
 

@@ -61,9 +61,7 @@ def test_the_image_is_the_networks_and_the_average_by_their_shares() -> None:
     pooled = pool(window, window.confidence)
     guides, border = (window.albedo, window.normal), (MIRRORED, MIRRORED)
     with torch.no_grad():
-        denoised = denoise_color(
-            model.backbone, pooled.image * 0.6, *guides, exposure=0.3, borders=(border, border)
-        )
+        denoised = denoise_color(model.backbone, pooled.image * 0.6, *guides, exposure=0.3, borders=(border, border))
     share = AVERAGE_BLEND["small"]
     wanted = (1 - share) * denoised / 0.6 + share * pooled.average
     torch.testing.assert_close(image_of(model, window), wanted, rtol=1e-5, atol=1e-6)

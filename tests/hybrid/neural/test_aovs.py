@@ -37,7 +37,7 @@ def test_layers_that_add_up_to_the_color_still_do(tmp_path):
         layers["diffuse"], layers["glossy"], layers["same"] = share * color, (1 - share) * color, color.copy()
 
     folder = SCENE.write(tmp_path, edit=split)
-    denoiser = open_network(shipped_weights("fast"), precision="float32")
+    denoiser = open_network(shipped_weights("balanced"), precision="float32")
     made = denoiser(align(folder, aovs=("diffuse", "glossy")))
     together = made.aovs["diffuse"] + made.aovs["glossy"]
     assert np.abs(together - made.color).max() < 1e-4 * made.color.mean()
@@ -72,7 +72,7 @@ def test_all_of_cycles_passes_and_light_groups_add_up(give_way, tmp_path):
     passes = {f"ViewLayer.{lobe}{kind}": f"{lobe}Col" for lobe in ("Diff", "Gloss") for kind in ("Dir", "Ind")}
     groups = {"ViewLayer.Combined_key", "ViewLayer.Combined_fill"}
     assert {*window.aovs} == {*passes, *groups, "ViewLayer.Emit"}
-    denoiser = open_network(shipped_weights("fast"), precision="float32", add_layers=give_way == "beauty")
+    denoiser = open_network(shipped_weights("balanced"), precision="float32", add_layers=give_way == "beauty")
     made = denoiser(window)
     assert all((layer >= 0).all() and np.isfinite(layer).all() for layer in made.aovs.values())
     frame = open_shot(tmp_path, aovs=("DiffCol", "GlossCol")).read(SCENE.first + 2)
@@ -80,7 +80,7 @@ def test_all_of_cycles_passes_and_light_groups_add_up(give_way, tmp_path):
     within = 1e-4 * made.color.mean()
     assert np.abs(together - made.color).max() < within
     assert np.abs(sum(made.aovs[name] for name in groups) - made.color).max() < within
-    alone = open_network(shipped_weights("fast"), precision="float32")(align(tmp_path)).color
+    alone = open_network(shipped_weights("balanced"), precision="float32")(align(tmp_path)).color
     assert (np.abs(made.color - alone).max() < within) == (give_way == "layers")
     # A picture that is the sum of its parts is denoised too: its noise has a deviation of 0.3.
     assert np.std(made.color - alone) < 0.1 * np.mean(alone)

@@ -20,6 +20,7 @@ from hybrid.pseudo_reference import FINAL, gated_average, pool_and_denoise
 from hybrid.stream import FrameStream
 from network.checkpoint import save_model
 from network.presets import build_preset
+from network.robust_average import RobustAverage
 from network.training.clips import Clip, Sample, open_clips
 from network.training.loop import centre_of
 from tests.scenes import Scene
@@ -54,21 +55,18 @@ def test_a_clip_holds_what_the_network_is_given_when_it_runs(dim, tmp_path, monk
     (clip,) = prepare(open_shot(tmp_path / "dim", frames=str(MIDDLE)), monkeypatch, tmp_path)
     given = {}
 
-    def spy(model, window, residual, **options):
-        given.update(
-            window._asdict(), residual=residual(slice(0, window.first_pass.shape[-2]))[None].transpose(0, 1, 4, 2, 3)
-        )
+    def spy(block, window):
+        given.update(window._asdict())
         raise StopIteration
 
-    monkeypatch.setattr(unet_denoiser, "denoise_window", spy)
-    save_model(tmp_path / "w.safetensors", build_preset("fast"))
+    monkeypatch.setattr(RobustAverage, "is_prior", False)
+    monkeypatch.setattr(RobustAverage, "forward", spy)
+    save_model(tmp_path / "w.safetensors", build_preset("balanced"))
     shot = open_shot(tmp_path / "dim", frames=str(MIDDLE))
     window = FrameStream(shot, Rules(), first_pass=Classical(FINAL)).align(MIDDLE)
     with pytest.raises(StopIteration):
-        open_network(tmp_path / "w.safetensors", tile=128, precision="float32")(window)
-    assert set(given) == {
-        "albedo", "normal", "first_pass", "residual", "confidence", "modulation", "exposure", "gain"
-    }  # fmt: skip
+        open_network(tmp_path / "w.safetensors", precision="float32")(window)
+    given |= {name: torch.from_numpy(window.guides[name]).permute(2, 0, 1)[None] for name in ("albedo", "normal")}
     for name, value in given.items():
         wanted = getattr(clip, "estimate" if name == "first_pass" else name)
         if name in ("albedo", "normal"):

@@ -22,11 +22,11 @@ STAGES = {"demodulate", "outliers", "warp"}
 SCENE = Scene(height=70, width=90, frames=5)
 
 
-@pytest.fixture(scope="module", params=["fast", "unet"])
+@pytest.fixture(scope="module", params=["balanced", "unet"])
 def weights(request, tmp_path_factory):
     """The final stage that ships; and kernels never trained: what they make of their input, they make everywhere."""
-    if request.param == "fast":
-        return shipped_weights("fast")
+    if request.param == "balanced":
+        return shipped_weights("balanced")
     path = tmp_path_factory.mktemp("weights") / "untrained.safetensors"
     model = build_preset("unet", seed=3)
     with torch.no_grad():  # stronger than at the start of training, so that kernels differ from pixel to pixel
@@ -175,7 +175,7 @@ def test_contributions_sum_to_what_is_made_of_them_and_weights_to_one(folder, we
     added = [f"{kind}.{name}" for kind in ("contribution", "weight") for name in names]
     assert list(denoised.extra) == [*added, "stage.align", "stage.gate", "stage.network"]
     parts, whole = sum(denoised.extra[f"contribution.{name}"] for name in names), denoised.color
-    if weights.stem == "fast":  # whose pictures are made of what the frames give together
+    if weights.stem == "balanced":  # whose pictures are made of what the frames give together
         whole = window.pool().image * window.modulation
     np.testing.assert_allclose(parts, whole, rtol=1e-4, atol=1e-5)  # of mean_of's epsilon, 1e-6
     shares = np.stack([denoised.extra[f"weight.{name}"] for name in names])

@@ -17,7 +17,7 @@ from network.presets import build_preset  # noqa: E402
 pytestmark = pytest.mark.neural
 
 
-@pytest.fixture(params=["fast", "unet"])
+@pytest.fixture(params=["balanced", "unet"])
 def weights(request, tmp_path):
     save_model(tmp_path / f"{request.param}.safetensors", build_preset(request.param))
     return tmp_path / f"{request.param}.safetensors"
@@ -26,7 +26,7 @@ def weights(request, tmp_path):
 def test_bad_options_are_refused(weights):
     for options, word in (
         ({"device": "abacus"}, "device"),
-        *([({"threshold": 0.5}, "no kernels")] if weights.stem == "fast" else []),
+        *([({"threshold": 0.5}, "no kernels")] if weights.stem == "balanced" else []),
     ):
         with pytest.raises(ValueError, match=word):
             open_network(weights, **options)
@@ -42,14 +42,14 @@ def test_the_denoiser_is_that_of_the_weights():
 
 def test_memory_is_that_of_a_tile_with_its_halo():
     """float32 takes twice as much, and a tile no more than the frame."""
-    half, full = (open_network(shipped_weights("fast"), precision=p, tile=64) for p in ("bfloat16", "float32"))
-    assert half.memory((1080, 1920)) == 100 * (64 + 2 * half.halo) ** 2
+    half, full = (open_network(shipped_weights("balanced"), precision=p, tile=64) for p in ("bfloat16", "float32"))
+    assert half.memory((1080, 1920)) == 150 * (64 + 2 * half.halo) ** 2
     assert full.memory((1080, 1920)) == 2 * half.memory((1080, 1920))
-    assert half.memory((10, 20)) == 100 * 10 * 20
+    assert half.memory((10, 20)) == 150 * 10 * 20
 
 
 def test_memory_of_a_first_pass_is_that_of_a_tile_with_its_halo(monkeypatch):
-    network = open_network(shipped_weights("fast"))
+    network = open_network(shipped_weights("balanced"))
     sizes = []
     for bfloat16 in (True, False):
         monkeypatch.setattr("hybrid.neural.oidn_networks.has_bfloat16", lambda _, bfloat16=bfloat16: bfloat16)
@@ -62,4 +62,4 @@ def test_a_network_that_needs_a_first_pass_says_so(tmp_path):
     shot = open_shot(Scene(frames=5).write(tmp_path))
     window = FrameStream(shot, only({"warp"})).align(shot.numbers[2])
     with pytest.raises(ValueError, match="estimate: expected those of the frames, as this network takes, got none"):
-        open_network(shipped_weights("fast"))(window)
+        open_network(shipped_weights("balanced"))(window)

@@ -23,7 +23,7 @@ class FiveFrames:
     frames = 5
 
 
-INPUTS = TrainInputs(Path("clips"), "fast")
+INPUTS = TrainInputs(Path("clips"), "balanced")
 
 
 def weights(model):
@@ -36,16 +36,16 @@ def equal(one, other):
 
 def test_a_preset_begins_with_the_weights_of_its_seed():
     model = _initial_model(INPUTS, FiveFrames(), seed=3)
-    assert equal(weights(model), weights(build_preset("fast", seed=3)))
-    assert not equal(weights(model), weights(build_preset("fast", seed=4)))
+    assert equal(weights(model), weights(build_preset("balanced", seed=3)))
+    assert not equal(weights(model), weights(build_preset("balanced", seed=4)))
 
 
 @pytest.mark.oidn
 @pytest.mark.skipif(importlib.util.find_spec("pyoidn") is None, reason="pyoidn is not installed")
 def test_oidn_is_the_backbone_that_training_begins_with():
     model = _initial_model(INPUTS._replace(init="oidn"), FiveFrames(), seed=3)
-    assert equal(weights(model.backbone), load_oidn("rt_hdr_alb_nrm_small").state_dict())
-    assert not equal(weights(model.backbone), weights(build_preset("fast", seed=3).backbone))
+    assert equal(weights(model.backbone), load_oidn("rt_hdr_alb_nrm").state_dict())
+    assert not equal(weights(model.backbone), weights(build_preset("balanced", seed=3).backbone))
 
 
 def test_oidn_is_asked_for_its_weights(monkeypatch):
@@ -75,7 +75,7 @@ def test_a_training_reuses_freed_memory(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize(
     ("init", "asked", "used"),
-    [(None, None, "input"), ("fast", None, "start"), ("fast", "input", "input")],
+    [(None, None, "input"), ("balanced", None, "start"), ("fast", "input", "input")],
 )
 def test_losses_are_over_those_at_the_start_where_weights_are_given(init, asked, used, monkeypatch, tmp_path):
     given = []

@@ -1,7 +1,6 @@
 """Windows on their way to the final stage: guides, and frames without light."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,10 +14,11 @@ from hybrid.files.shots import open_shot  # noqa: E402
 from hybrid.first_pass import Classical  # noqa: E402
 from hybrid.neural import open_network, unet_denoiser  # noqa: E402
 from hybrid.neural.unet_denoiser import clean_guides  # noqa: E402
-from hybrid.pseudo_reference import DRAFT  # noqa: E402
+from hybrid.pseudo_reference import DRAFT, gated_average  # noqa: E402
 from hybrid.stabilize import Denoised, FrameDenoiser  # noqa: E402
 from hybrid.stream import FrameStream  # noqa: E402
 from network.checkpoint import shipped_weights  # noqa: E402
+from network.robust_unet import RobustUNet  # noqa: E402
 
 pytestmark = pytest.mark.neural
 
@@ -36,8 +36,8 @@ def test_a_black_frame_stays_black(tmp_path, monkeypatch):
         layers["ViewLayer.Combined"][:] = 0
 
     window = align(SCENE.write(tmp_path, edit=darken))
-    monkeypatch.setattr(unet_denoiser, "denoise_window", None)
-    assert not open_network(shipped_weights("fast"))(window).color.any()
+    monkeypatch.setattr(RobustUNet, "denoise", None)
+    assert not open_network(shipped_weights("balanced"))(window).color.any()
 
 
 def test_guides_are_cleaned_where_they_have_noise(tmp_path, monkeypatch):
@@ -53,7 +53,7 @@ def test_guides_are_cleaned_where_they_have_noise(tmp_path, monkeypatch):
 
 
 def test_only_a_network_that_relies_on_clean_guides_has_them_filtered(monkeypatch):
-    for has, preset, filters in ((True, "quality", True), (False, "quality", False), (True, "fast", False)):
+    for has, preset, filters in ((True, "quality", True), (False, "quality", False), (True, "balanced", False)):
         monkeypatch.setattr(unet_denoiser, "has_oidn_networks", lambda has=has: has)
         found = open_network(shipped_weights(preset)).filter_guides
         assert found is (unet_denoiser.prefilter_guides if filters else None)
@@ -79,7 +79,7 @@ def test_a_shot_of_few_samples_is_denoised_with_filtered_guides(tmp_path):
         assert len(asked) == SCENE.frames * ("clean-guides" in stages)
 
 
-@pytest.mark.parametrize("preset", ["fast", "quality"])
+@pytest.mark.parametrize("preset", ["balanced", "quality"])
 def test_only_a_network_that_relies_on_clean_guides_gets_them(preset, tmp_path, monkeypatch):
     folder = SCENE.write(tmp_path)
     denoiser = open_network(shipped_weights(preset), precision="float32")
@@ -92,22 +92,15 @@ def test_only_a_network_that_relies_on_clean_guides_gets_them(preset, tmp_path, 
 
 def test_a_window_is_guided_where_the_network_reads_its_guide(monkeypatch):
     """Its confidence by geometry and its clean albedo took eight planes that no other network reads."""
-    for has, preset, guided in ((True, "quality", False), (False, "quality", True), (False, "fast", False)):
+    for has, preset, guided in ((True, "quality", False), (False, "quality", True), (False, "balanced", False)):
         monkeypatch.setattr(unet_denoiser, "has_oidn_networks", lambda has=has: has)
         assert open_network(shipped_weights(preset)).guided == guided
 
 
-def test_the_network_gets_limited_residuals():
-    """Those of bright samples, with the light that the limit takes spread around them."""
-    asked = []
-
-    class Sources:
-        def residual(self, part, *, limited=False):
-            asked.append((part, limited))
-
-    block = slice(10, 50), slice(0, 30)
-    unet_denoiser._residual_rows(SimpleNamespace(sources=Sources()), block, slice(2, 7))
-    assert asked == [((slice(12, 17), block[1]), True)]
+def test_without_a_network_the_image_is_the_average_of_first_passes(tmp_path):
+    window = align(SCENE.write(tmp_path))
+    denoised = open_network(shipped_weights("fast"))(window)
+    np.testing.assert_allclose(denoised.color, gated_average(window), rtol=1e-6)
 
 
 def test_residuals_are_made_once_for_the_samples_and_once_for_the_network(tmp_path, monkeypatch):
@@ -119,7 +112,6 @@ def test_residuals_are_made_once_for_the_samples_and_once_for_the_network(tmp_pa
         return residual(sources, *part, limited=limited)
 
     monkeypatch.setattr(WarpSources, "residual", count)
-    monkeypatch.setattr("network.strips.ROWS", 400)  # all in one strip
     stream = FrameStream(open_shot(SCENE.write(tmp_path)), only({"warp", "blend-samples"}), first_pass=Classical(DRAFT))
-    FrameDenoiser(stream, open_network(shipped_weights("fast"))).make(SCENE.first + 2)
+    FrameDenoiser(stream, open_network(shipped_weights("balanced"))).make(SCENE.first + 2)
     assert sorted(made) == [False, True]

@@ -79,8 +79,8 @@ def decibels(image, number=FRAME):
     return float(-10 * np.log10(np.mean((seen - clean[0]) * (seen - clean[1]))))
 
 
-# Measured: 0.60, 0.76 and 1.18 dB.
-@pytest.mark.parametrize(("preset", "gain"), [("fast", 0.4), ("balanced", 0.5), ("quality", 0.9)])
+# Measured: 0.76 and 1.18 dB.
+@pytest.mark.parametrize(("preset", "gain"), [("balanced", 0.5), ("quality", 0.9)])
 def test_the_network_is_worth_more_than_the_average_it_starts_from(preset, gain):
     """Put `gated_average` in its place, and something must be missing."""
     denoiser = open_network(shipped_weights(preset))
@@ -103,7 +103,7 @@ def test_the_robust_average_block_is_worth_something(preset, loss, monkeypatch):
     assert whole > decibels(picture(denoiser)) + loss
 
 
-@pytest.mark.parametrize("preset", ["fast"])
+@pytest.mark.parametrize("preset", ["fast", "balanced"])
 def test_a_correction_by_the_block_changes_the_image(preset, tmp_path):
     """Computed at full size, as for trained weights, a correction of 0 changes nothing."""
     model = load_model(shipped_weights(preset))

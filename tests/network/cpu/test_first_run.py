@@ -26,7 +26,7 @@ def test_a_run_compiles_nothing_more(tmp_path) -> None:
     """Loops for other types would be compiled in vain."""
     compile_loops()
     scene = Scene(height=40, width=48, frames=5)
-    denoiser = open_network(shipped_weights("fast"))
+    denoiser = open_network(shipped_weights("balanced"))
     stream = FrameStream(open_shot(scene.write(tmp_path)), only({"warp"}), first_pass=Classical(DRAFT))
     window = stream.align(scene.first + 2)
     with event.install_recorder("numba:compile") as compiled:
