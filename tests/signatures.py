@@ -1,4 +1,4 @@
-"""The loops that a run of `balanced` has called: ``python -m tests.signatures`` writes `hybrid.runtime.signatures.FILE`."""
+"""Loops that a run of `balanced` has called: ``python -m tests.signatures`` writes `hybrid.runtime.signatures.FILE`."""
 
 from __future__ import annotations
 
