@@ -38,7 +38,6 @@ CONFIGURATIONS: dict[str, tuple[str, list[str]]] = {
     "draft": ("plain", ["pseudoref", "--preset", "draft"]),
     "standard": ("plain", ["pseudoref", "--preset", "standard"]),
     "final": ("plain", ["pseudoref", "--preset", "final"]),
-    "gathered": ("plain", ["pseudoref", "--preset", "gathered"]),
     "pseudoref-sequence": ("plain", ["pseudoref", "--estimate", "sequence/reference.####.exr"]),
     "nlm": ("plain", ["denoise", "--estimate", "nlm", *F32]),
     "bundled": ("plain", ["denoise", "--estimate", "bundled", *F32]),

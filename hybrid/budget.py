@@ -34,7 +34,7 @@ def parse_budget(text: str) -> float:
 
 
 def measure_presets(
-    shot: Shot, presets: Iterable[str], load: Callable[[str], tuple[Rules, WindowDenoiser, FirstPassSource]]
+    shot: Shot, rules: Rules, presets: Iterable[str], load: Callable[[str], tuple[WindowDenoiser, FirstPassSource]]
 ) -> Iterator[Measured]:
     """Measure presets, the most accurate first, on the middle of a shot, until one fits that nothing slower follows.
 
@@ -50,7 +50,7 @@ def measure_presets(
     shot.read(numbers[-1])
     reading = time.perf_counter() - start
     for preset in presets:
-        rules, denoiser, source = load(preset)
+        denoiser, source = load(preset)
         # A sequence holds whole frames, and only a part is measured.
         whole = source.name == "sequence"
         given: FirstPass | None = PerFrame(lambda frame: frame.color) if whole else source.first_pass

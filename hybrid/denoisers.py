@@ -7,7 +7,7 @@ from typing import ClassVar, Protocol
 from hybrid.alignment.guides import GuideFilter
 from hybrid.alignment.window import AlignedWindow
 from hybrid.first_pass import Backends
-from hybrid.pseudo_reference import ClassicalPreset, filter_window, gated_average, pool_and_denoise
+from hybrid.pseudo_reference import ClassicalPreset, filter_window, gated_average
 from hybrid.runtime.timing import Timings
 from hybrid.stabilize import Denoised
 
@@ -18,7 +18,6 @@ class WindowDenoiser(Protocol):
     needs_first_pass: ClassVar[bool] = True  # whether windows must hold a first pass
     clamps: bool = False  # whether results are clamped to `AlignedWindow.sample_range`
     guided: bool = True  # whether `AlignedWindow.guide` or its confidence by geometry is read where there are no AOVs
-    pools: ClassVar[bool] = False  # whether samples of the window are pooled and denoised by OIDN
     packages: ClassVar[tuple[str, ...]] = ()  # packages that pixels depend on
 
     @property
@@ -74,20 +73,3 @@ class AverageDenoiser(WindowDenoiser):
 
     def __call__(self, aligned: AlignedWindow) -> Denoised:
         return Denoised(gated_average(aligned, timings=self.timings))
-
-
-@dataclass(frozen=True)
-class PooledDenoiser(WindowDenoiser):
-    """OIDN on the pooled samples of the window (`hybrid.pseudo_reference.pool_and_denoise`)."""
-
-    device: str
-    timings: Timings
-    packages = ("pyoidn",)
-    pools = True
-
-    @property
-    def devices(self) -> Mapping[str, str]:
-        return {"oidn": self.device}
-
-    def __call__(self, aligned: AlignedWindow) -> Denoised:
-        return Denoised(pool_and_denoise(aligned, device=self.device, timings=self.timings))

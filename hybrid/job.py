@@ -16,7 +16,7 @@ from typing import Literal, NamedTuple, Self, get_args, get_origin, get_type_hin
 
 from hybrid.breakdown import Breakdown, write_breakdown
 from hybrid.budget import measure_presets, parse_budget
-from hybrid.denoisers import AverageDenoiser, ClassicalDenoiser, PooledDenoiser, WindowDenoiser
+from hybrid.denoisers import AverageDenoiser, ClassicalDenoiser, WindowDenoiser
 from hybrid.files.passes import BEAUTY
 from hybrid.files.replace import check_outputs, temporary_folder
 from hybrid.files.sequences import format_frames
@@ -32,10 +32,9 @@ from hybrid.first_pass import (
     find_first_pass,
 )
 from hybrid.memory import MemoryPlan, parse_size, plan_memory
-from hybrid.oidn import find_device
 from hybrid.option_texts import option_texts
 from hybrid.pipeline import Failed, Finished, RunSettings, View, denoise_frames, sources_of, temporal_support
-from hybrid.plan import LEFT_OUT, NEURAL_STAGES, Rules
+from hybrid.plan import NEURAL_STAGES, Rules
 from hybrid.preview import check_png
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, FINAL
 from hybrid.runtime.allocator import reuse_freed_memory
@@ -50,10 +49,9 @@ LOG = logging.getLogger("ravg")
 PRESETS: dict[str, tuple[str, ...]] = {
     "network": ("balanced", "fast", "quality", "auto"),
     "classical": ("standard", "draft", "final"),
-    "pooled": ("pooled",),
 }
 METHOD_OF_PRESET = {preset: method for method, presets in PRESETS.items() for preset in presets}
-FIRST_PASS_OF_METHOD = {"network": "auto", "classical": "none", "pooled": "oidn-fast"}
+FIRST_PASS_OF_METHOD = {"network": "auto", "classical": "none"}
 CHOICES = {"precision": ("auto", "float32", "bfloat16"), "aov_sum": ("layers", "beauty")}
 LIMITS = {"passes": (1, math.inf), "tile": (16, math.inf), "threads": (1, MOST_THREADS)}
 # Types of option values: those accepted for each, and their names in messages.
@@ -109,7 +107,9 @@ class DenoiseOptions:
 
     def __post_init__(self) -> None:
         self._check_types()
-        preset = "pooled" if self.preset == "gathered" else self.preset  # its name for one release
+        preset = self.preset
+        if "pooled" in (preset, self.method) or preset == "gathered":
+            raise ValueError("pooled is no method any more, expected preset quality, which does the same and more")
         if preset == "tkpcn":
             weights = "network/paper/weights/tkpcn.safetensors"
             raise ValueError(f"preset is 'tkpcn', no preset any more, expected --weights {weights}")
@@ -123,8 +123,6 @@ class DenoiseOptions:
             expected = ", ".join(PRESETS[method])
             raise ValueError(f"preset is {preset!r}, expected one of {expected} with method {method}")
         first_pass = self.first_pass or FIRST_PASS_OF_METHOD[method]
-        if method == "pooled" and first_pass == "none":
-            first_pass = FIRST_PASS_OF_METHOD[method]
         for name, value in (("method", method), ("preset", preset), ("first_pass", first_pass)):
             object.__setattr__(self, name, value)
         check_first_pass(first_pass)
@@ -185,10 +183,9 @@ class DenoiseOptions:
 
     @property
     def rules(self) -> Rules:
-        """The forced stages. Off are also those of networks without one, and those that the preset leaves out."""
-        off = frozenset() if self.method == "network" else NEURAL_STAGES
-        off |= LEFT_OUT.get(self.preset, frozenset()) if self.weights is None else frozenset()
-        return Rules(frozenset(self.stages), frozenset(self.no_stages) | (off - frozenset(self.stages)))
+        """The forced stages; those that only a network has are off without one."""
+        off = frozenset(self.no_stages) | (frozenset() if self.method == "network" else NEURAL_STAGES)
+        return Rules(frozenset(self.stages), off)
 
     @property
     def weights_file(self) -> Path | None:
@@ -271,8 +268,6 @@ def open_denoiser(
     ImportError if OIDN is asked for and not installed.
     """
     timings = timings or Timings()
-    if options.method == "pooled":
-        return PooledDenoiser(find_device(options.device), timings)
     if options.method == "classical":
         if options.first_pass != "none":
             return AverageDenoiser(timings)
@@ -378,14 +373,14 @@ def _check_views(views: Sequence[Shot], report: ValidationReport, options: Denoi
 def _fit_budget(view: Shot, options: DenoiseOptions) -> DenoiseOptions:
     """The options with the most accurate preset that is measured to fit the budget, or with the fastest."""
 
-    def load(preset: str) -> tuple[Rules, WindowDenoiser, FirstPassSource]:
+    def load(preset: str) -> tuple[WindowDenoiser, FirstPassSource]:
         # Nothing is kept: the frames that are measured are parts.
         measured = replace(options, preset=preset, budget=None, keep_first_pass=None)
         denoiser = open_denoiser(measured)
-        return measured.rules, denoiser, choose_first_pass(view, measured, denoiser)
+        return denoiser, choose_first_pass(view, measured, denoiser)
 
     limit, tried = parse_budget(str(options.budget)), []
-    for measured in measure_presets(view, MEASURED, load):
+    for measured in measure_presets(view, options.rules, MEASURED, load):
         tried.append(f"{measured.preset} {measured.seconds:.2g} s")
         fits = measured.seconds <= limit
         if fits:
@@ -523,7 +518,6 @@ class Job:
             radius=self.denoiser.radius,
             network=self.denoiser.memory,
             first_network=self.denoiser.backends.memory,
-            pools=self.denoiser.pools,
             filters_guides=self.denoiser.filter_guides is not None,
         )
 

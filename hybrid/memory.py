@@ -13,7 +13,7 @@ from hybrid.alignment.align import MARGIN, aligned_planes
 from hybrid.alignment.prepare import prepared_planes
 from hybrid.files.layers import Layers
 from hybrid.files.shots import Shot
-from hybrid.oidn import HOLDS, HOLDS_FAST
+from hybrid.oidn import HOLDS
 from hybrid.stream import FirstPass, can_refine, kept_planes
 
 STRIP = 64  # rows are taken in whole strips of the guided filter
@@ -72,7 +72,6 @@ def plan_memory(
     radius: int = 2,
     network: Callable[[tuple[int, int]], int | None] = lambda _: None,
     first_network: Callable[[tuple[int, int]], int] = lambda _: 0,
-    pools: bool = False,
     filters_guides: bool = False,
 ) -> MemoryPlan:
     """Plan a run: whole frames in memory if they fit, else with what is kept in files, and as many rows as then fit.
@@ -81,7 +80,7 @@ def plan_memory(
     `fast` there takes 1.07 times the CPU time with files (two runs), and 1.18 times where freed memory is returned too.
     The result is the same for the same arguments, on every machine. `stages` are those that may run on some frame,
     `network` maps height and width to the bytes that a network takes while it runs, `first_network` to those of one
-    that makes a first pass; with `pools` samples are pooled and denoised by OIDN; with `filters_guides` the guides of
+    that makes a first pass; with `filters_guides` the guides of
     frames are filtered for a network. Raises ValueError, with what is needed, if not even the fewest rows fit.
 
     Counted in planes of one float32 a pixel: planes kept for a window, and the most that exist at once while a frame is
@@ -104,9 +103,6 @@ def plan_memory(
     plane = 4 * height * width
     base, code = (BASE_NEURAL, OIDN_NEURAL) if neural else (BASE, OIDN)
     holds = 0 if first_pass is None else first_pass.holds
-    if pools:
-        holds = max(holds, HOLDS_FAST)
-        worked += 3 * (2 * radius + 1) + 18  # residuals, pooled samples and their average
     oidn = min(holds, code + OIDN_OF_PIXEL * height * width * holds // HOLDS)
 
     def needed(rows: int, in_files: bool, trims: bool = True, background: bool = False) -> int:
@@ -118,8 +114,7 @@ def plan_memory(
         # The features of a strip are as large in a band.
         working = plane * share * (worked + read * (1 if neural else 2)) + (network(shot.shape) or 0)
         working = max(working, plane * share * (aligned + 2 * read))
-        # A first pass is made while frames are prepared; pooled samples are denoised while rows are worked on.
-        working += oidn if pools else min(oidn, CODE)
+        working += min(oidn, CODE)  # a first pass is made while frames are prepared
         cleaning = CLEANING if filters_guides else 0
         # With frames in memory the final stage takes more than a first pass.
         made = plane * PASSING + first_network(shot.shape) if in_files else 0

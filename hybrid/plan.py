@@ -36,9 +36,6 @@ STAGES = {
 #: Old names of stages, accepted for one release.
 OLD_NAMES = {"steady": "stabilize", "mean": "restore-mean", "samples": "blend-samples"}
 NEURAL_STAGES = frozenset({"clean-guides", "stabilize", "alpha", "skip"})  # stages of networks alone
-#: Stages that a preset leaves out. With a renderer's vectors refinement takes a sixth of the time, and `balanced` loses
-#: 0.03 dB by it in the mean of forty shots and levels, and gains 0.06 dB in time; vectors that are off need it.
-LEFT_OUT = dict.fromkeys(("fast", "balanced"), frozenset({"refine"}))
 
 STILL = 0.05  # motion below a twentieth of a pixel blurs a bilinear sample by less than 1 % of its contrast
 # Share of pixels, in areas of 9×9, whose brightness the vectors do not explain. Refinement is worth its time for
@@ -149,6 +146,12 @@ class Rules:
             on, reason = True, f"denoised frames are compared in any case; measured: {reason}"
         if stage == "outliers" and context.first_pass and on:
             on, reason = False, f"the averaging of denoised frames bounds what single samples add; {reason}"
+        if stage == "refine" and context.first_pass and on and not forced:
+            # On forty shots and levels `balanced` loses 0.03 dB by it, and `quality` gains 0.01; a sixth of the time.
+            on, reason = (
+                False,
+                f"denoised frames that vectors misplace do not count (forced, it corrects vectors that are off); {reason}",
+            )
         if stage == "drift" and on and (not context.first_pass or context.radius < 2):
             on, reason = False, f"needs denoised frames, and windows of five or more; {reason}"
         if stage == "clean-guides" and on and not context.filters_guides:

@@ -93,7 +93,7 @@ def gated_average(aligned: AlignedWindow, *, timings: Timings | None = None) -> 
         return average(aligned.first_pass, aligned.confidence) * aligned.modulation
 
 
-def pool_and_denoise(aligned: AlignedWindow, *, device: str = "cpu", timings: Timings | None = None) -> Array:
+def pool_and_denoise(aligned: AlignedWindow) -> Array:
     """Pool the samples of a window at its centre, and denoise them with OIDN; radiance (H, W, 3), finite.
 
     Raises ValueError without a first pass, of which the cheapest suffices (`oidn-fast`); ImportError without pyoidn.
@@ -105,22 +105,16 @@ def pool_and_denoise(aligned: AlignedWindow, *, device: str = "cpu", timings: Ti
     """
     if aligned.centre_first_pass is None:
         raise ValueError("aligned: expected a window with estimates, got none")
-    timings = timings or Timings()
-    with timings.stage("pool"):
-        pooled = aligned.pool()
-        mean = pooled.average * aligned.modulation
-        image = pooled.image * aligned.modulation
-    with timings.stage("denoise"):
-        albedo, normal = aligned.guides.get("albedo"), aligned.guides.get("normal")
-        noisy_guides = "prefilter" in aligned.stages
-        denoised = denoise_oidn(
-            np.maximum(image, 0),
-            albedo,
-            None if albedo is None else normal,  # OIDN accepts no normal alone
-            prefilter="balanced" if noisy_guides else None,
-            clean=not noisy_guides,
-            scale=measure_gain(aligned.centre_first_pass),
-            device=device,
-        )
-    with timings.stage("pool"):
-        return np.asarray(mean + np.float32(SECOND_LOOK) * (denoised - mean), np.float32)
+    pooled = aligned.pool()
+    mean = pooled.average * aligned.modulation
+    albedo, normal = aligned.guides.get("albedo"), aligned.guides.get("normal")
+    noisy_guides = "prefilter" in aligned.stages
+    denoised = denoise_oidn(
+        np.maximum(pooled.image * aligned.modulation, 0),
+        albedo,
+        None if albedo is None else normal,  # OIDN accepts no normal alone
+        prefilter="balanced" if noisy_guides else None,
+        clean=not noisy_guides,
+        scale=measure_gain(aligned.centre_first_pass),
+    )
+    return np.asarray(mean + np.float32(SECOND_LOOK) * (denoised - mean), np.float32)

@@ -21,8 +21,8 @@ from hybrid.first_pass import (
     read_denoised,
 )
 from hybrid.oidn import Quality
-from hybrid.plan import LEFT_OUT, Rules
-from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window, gated_average, pool_and_denoise
+from hybrid.plan import Rules
+from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window, gated_average
 from hybrid.stabilize import FrameDenoiser
 from hybrid.stream import FrameStream
 from nlm.average import average, replace_nonfinite, robust_average
@@ -206,8 +206,7 @@ def _aligned(family: str, denoise: WindowFilter, source: str = "none", **setting
 
 
 def _network(preset: str, source: str) -> Method:
-    rules = Rules(off=LEFT_OUT.get(preset, frozenset()))
-    run = Network(preset, WindowSettings(source=source, rules=rules))
+    run = Network(preset, WindowSettings(source=source))
     return Method(run, "Networks", run.maps, settings={"weights": preset, "first pass": source})
 
 
@@ -234,7 +233,6 @@ METHODS: dict[str, Method] = {
     "gated": _aligned("Gated averages", gated_average, source="nlm"),
     "gated OIDN fast": _aligned("Gated averages", gated_average, source="oidn-fast"),
     "gated OIDN": _aligned("Gated averages", gated_average, source="oidn"),
-    "pooled": _aligned("Gated averages", pool_and_denoise, source="oidn-fast"),
     "network without OIDN": _network("fast", "bundled"),
     **{f"network {preset}": _network(preset, OIDN_MODE_OF_NETWORKS) for preset in NETWORKS},
     "tKPCN": _network("tkpcn", "none"),

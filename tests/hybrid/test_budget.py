@@ -62,9 +62,9 @@ def test_presets_are_measured_in_turn(tmp_path, monkeypatch, estimate):
     source = find_first_pass(str(folder) if estimate == "sequence" else estimate, shot)
 
     def load(preset):
-        return Rules(), Fake(lambda window: seen.append((preset, window.number))), source
+        return Fake(lambda window: seen.append((preset, window.number))), source
 
-    measured = list(measure_presets(shot, MEASURED, load))
+    measured = list(measure_presets(shot, Rules(), MEASURED, load))
     assert [m.preset for m in measured] == ["quality", "balanced", "fast"]
     assert all(m.seconds > 0 for m in measured)
     # Two frames in the middle, and those beside them, whose pictures they are averaged with.
@@ -75,8 +75,7 @@ def test_of_two_frames_that_are_all_both_count(tmp_path):
     shot = open_shot(replace(SCENE, frames=2).write(tmp_path))
     source = find_first_pass("nlm", shot)
     # Both pictures are made for the first frame; the second alone would have cost next to nothing.
-    slow = Rules(), Fake(lambda window: time.sleep(0.2)), source
-    measured = measure_presets(shot, MEASURED, lambda _: slow)
+    measured = measure_presets(shot, Rules(), MEASURED, lambda _: (Fake(lambda window: time.sleep(0.2)), source))
     assert all(m.seconds >= 0.2 for m in measured)
 
 

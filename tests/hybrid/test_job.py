@@ -196,7 +196,7 @@ def test_a_callback_or_closing_ends_the_work_after_a_frame(tmp_path):
     ("options", "words"),
     [
         ({"preset": "best"}, "expected one of balanced, fast"),
-        ({"method": "magic"}, "expected one of network, classical, pooled"),
+        ({"method": "magic"}, "expected one of network, classical"),
         ({"method": "classical", "preset": "fast"}, "expected one of standard, draft, final with method classical"),
         ({"preset": "auto"}, "budget chooses the preset"),
         ({"threshold": 1.0}, "expected 0 <= threshold < 1"),
@@ -244,14 +244,12 @@ def test_what_is_no_shot_no_output_or_no_options_is_refused(shot_folder, tmp_pat
 
 
 def test_presets_and_methods_belong_together():
-    assert [DenoiseOptions(preset=name).method for name in ("quality", "draft", "pooled", "gathered")] == [
-        "network",
-        "classical",
-        "pooled",
-        "pooled",
-    ]
-    assert [DenoiseOptions(method=name).preset for name in PRESETS] == ["balanced", "standard", "pooled"]
-    assert [DenoiseOptions(method=name).first_pass for name in PRESETS] == ["auto", "none", "oidn-fast"]
+    assert [DenoiseOptions(preset=name).method for name in ("quality", "draft")] == ["network", "classical"]
+    assert [DenoiseOptions(method=name).preset for name in PRESETS] == ["balanced", "standard"]
+    assert [DenoiseOptions(method=name).first_pass for name in PRESETS] == ["auto", "none"]
+    for options in ({"preset": "pooled"}, {"preset": "gathered"}, {"method": "pooled"}):
+        with pytest.raises(ValueError, match="pooled is no method any more, expected preset quality"):
+            DenoiseOptions(**options)
 
 
 def test_the_old_name_of_the_first_pass_is_accepted():

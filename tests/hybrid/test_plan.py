@@ -47,15 +47,24 @@ def test_without_vectors_motion_is_looked_for_only_where_something_moves(tmp_pat
     assert not still["warp"].on
 
 
-def test_vectors_that_do_not_explain_the_picture_call_for_refinement_and_the_gate(tmp_path):
-    def reflect(index, layers):
-        y, x = np.mgrid[: Scene.height, : Scene.width]
-        # A bright disc that stands still while the vectors say that everything moves: a reflection.
-        layers["ViewLayer.Combined"][(y - 20) ** 2 + (x - 10 - 14 * index) ** 2 < 64] *= 5
+def reflect(index, layers):
+    """A bright disc that stands still while the vectors say that everything moves: a reflection."""
+    y, x = np.mgrid[: Scene.height, : Scene.width]
+    layers["ViewLayer.Combined"][(y - 20) ** 2 + (x - 10 - 14 * index) ** 2 < 64] *= 5
 
+
+def test_vectors_that_do_not_explain_the_picture_call_for_refinement_and_the_gate(tmp_path):
     found = decisions(Scene().write(tmp_path, edit=reflect))
     assert found["refine"].on
     assert found["gate"].on
+
+
+def test_denoised_frames_call_for_no_refinement_unless_it_is_forced(tmp_path):
+    shot = open_shot(Scene().write(tmp_path, edit=reflect))
+    for rules, on in ((Rules(), False), (Rules(on=frozenset({"refine"})), True)):
+        found = decision_of("refine", plan_shot(shot, rules, context=DENOISED))
+        assert found.on == on
+        assert "the vectors leave" in found.reason
 
 
 def test_what_ran_on_a_part_of_the_picture_says_on_how_much(shot_folder):

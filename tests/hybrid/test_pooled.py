@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import importlib.util
-import sys
 
 import numpy as np
 import pytest
 
 from hybrid import pseudo_reference
 from hybrid.alignment.transfer import demodulate, measure_gain
-from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
 from hybrid.files.shots import open_shot
 from hybrid.first_pass import PerFrame, find_first_pass
-from hybrid.oidn import _device
 from hybrid.pseudo_reference import SECOND_LOOK, gated_average, pool_and_denoise
 from hybrid.stabilize import Denoised, FrameDenoiser
 from hybrid.stream import FrameStream
@@ -113,16 +110,6 @@ def test_a_window_without_estimates_is_an_error(tmp_path) -> None:
         pool_and_denoise(aligned)
 
 
-def test_without_pyoidn_the_command_says_so(tmp_path, monkeypatch, capfd) -> None:
-    folder = SCENE.write(tmp_path / "noisy")
-    _device.cache_clear()
-    monkeypatch.setitem(sys.modules, "pyoidn", None)
-    made = str(folder / "shot.####.exr")  # any finished sequence will do as the first look
-    words = ["denoise", str(folder), "-o", str(tmp_path / "out"), "--preset", "pooled"]
-    assert main([*words, "--first-pass", made]) == 1
-    assert 'pip install "pyoidn"' in capfd.readouterr().err
-
-
 class TestWithOidn:
     pytestmark = needs_oidn
 
@@ -151,11 +138,3 @@ class TestWithOidn:
         ]
         # Two networks, one after the other, see 192 rows far, and a part has 128 around it.
         assert np.abs(parts[0] - parts[1]).max() < 1e-3 * parts[1].mean()
-
-    def test_the_command_takes_the_cheapest_first_look(self, tmp_path, capfd) -> None:
-        folder = SCENE.write(tmp_path / "noisy")
-        out = tmp_path / "out"
-        assert main(["denoise", str(folder), "-o", str(out), "--preset", "pooled", "--frames", str(MIDDLE)]) == 0
-        assert "First pass  oidn-fast" in capfd.readouterr().err
-        made, given = open_shot(out).read(MIDDLE), open_shot(folder).read(MIDDLE)
-        assert psnr(made.color, truth(given)) > psnr(given.color, truth(given)) + 10

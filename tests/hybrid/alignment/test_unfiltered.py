@@ -129,7 +129,7 @@ def test_parts_keep_their_negative_light(tmp_path):
         assert image.channel(f"{name}.R")[15:25, 19:33].mean() == pytest.approx(mean, rel=0.06)
 
 
-@pytest.mark.parametrize("command", [*COMMANDS, ["denoise", "--preset", "pooled"]])
+@pytest.mark.parametrize("command", COMMANDS)
 def test_gray_stays_gray(tmp_path, command):
     """Networks that learned from colors tinted it by half a percent."""
     found = read_exr(denoised(tmp_path, colors(), command, half=False)).pixels(("color.R", "color.G", "color.B"))
