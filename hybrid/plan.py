@@ -148,10 +148,8 @@ class Rules:
             on, reason = False, f"the averaging of denoised frames bounds what single samples add; {reason}"
         if stage == "refine" and context.first_pass and on and not forced:
             # On forty shots and levels `balanced` loses 0.03 dB by it, and `quality` gains 0.01; a sixth of the time.
-            on, reason = (
-                False,
-                f"denoised frames that vectors misplace do not count (forced, it corrects vectors that are off); {reason}",
-            )
+            words = "denoised frames that vectors misplace do not count (forced, it corrects vectors that are off)"
+            on, reason = False, f"{words}; {reason}"
         if stage == "drift" and on and (not context.first_pass or context.radius < 2):
             on, reason = False, f"needs denoised frames, and windows of five or more; {reason}"
         if stage == "clean-guides" and on and not context.filters_guides:

@@ -105,7 +105,7 @@ class RobustAverage(nn.Module):
     @property
     def is_prior(self) -> bool:
         """Whether f is 0 everywhere: the weights are then the confidence."""
-        return not any(bool(value.any()) for value in cast(nn.Module, self.correction[-1]).parameters())
+        return not any(bool(value.any()) for value in self.correction[-1].parameters())
 
     def forward(self, window: UNetWindow) -> Tensor:
         """Return the weights ``(N, T, 1, H, W)``, at least 0."""

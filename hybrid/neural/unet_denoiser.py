@@ -92,7 +92,8 @@ class UNetDenoiser(NetworkDenoiser):
         height, width = aligned.confidence.shape[1:]
         borders: Borders = border(outer[0], height), border(outer[1], width)
         layers = (*window.pooled[::-1], aligned.modulation, *(window.guides.get(n) for n in ("albedo", "normal")))
-        image = self.model.denoise(*(self._cut(layer, outer) for layer in layers), gain_of(aligned), borders)
+        gain = gain_of(aligned).to(self.setup.torch_device)
+        image = self.model.denoise(*(self._cut(layer, outer) for layer in layers), gain, borders)
         return Tile(image, None, partial(self._parts, aligned, window.weights, outer))
 
     def _parts(self, aligned: AlignedWindow, weights: Array, outer: Block) -> tuple[torch.Tensor, torch.Tensor]:
@@ -105,17 +106,15 @@ class UNetDenoiser(NetworkDenoiser):
 
     def _window(self, aligned: AlignedWindow, outer: Block) -> UNetWindow:
         """Part of a window as tensors."""
+        assert aligned.first_pass is not None
         residual = aligned.sources.residual(outer, limited=True)
-        first_pass, confidence = (
-            self._cut_window(layer, outer) for layer in (aligned.first_pass, aligned.confidence[..., None])
-        )
         return UNetWindow(
-            first_pass,
+            self._cut_window(aligned.first_pass, outer),
             tensor_of(residual, copied=False).to(self.setup.torch_device),
-            confidence,
-            self._cut(aligned.modulation, outer),
-            exposure_of(aligned),
-            gain_of(aligned),
+            self._cut_window(aligned.confidence[..., None], outer),
+            self._cut_window(aligned.modulation[None], outer)[:, 0],
+            exposure_of(aligned).to(self.setup.torch_device),
+            gain_of(aligned).to(self.setup.torch_device),
         )
 
     def _cut_window(self, layer: Array, outer: Block) -> torch.Tensor:

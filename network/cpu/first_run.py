@@ -4,17 +4,18 @@ import gc
 
 import torch
 
+from network.bfloat16 import round_unet
 from network.devices import has_bfloat16
-from network.robust_unet import RobustUNet, RobustUNetConfig, for_inference
-from network.unet import denoise_color
+from network.unet import OidnUNet, OidnUNetConfig, denoise_color
 
 
 def compile_loops() -> None:
     """Run a small network on nothing."""
-    model = for_inference(RobustUNet(RobustUNetConfig(5, "small")), has_bfloat16(torch.device("cpu")))
+    unet = OidnUNet(OidnUNetConfig(size="small")).eval().requires_grad_(False)
+    unet = round_unet(unet) if has_bfloat16(torch.device("cpu")) else unet
     image = torch.zeros(1, 16, 16, 3).movedim(-1, 1)
     with torch.inference_mode():
-        denoise_color(model.backbone, image, image, image, exposure=1.0)
+        denoise_color(unet, image, image, image, exposure=1.0)
 
 
 if __name__ == "__main__":

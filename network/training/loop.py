@@ -140,7 +140,7 @@ def _crop_losses(
             value = value + weight * losses.image_loss(loss, output.irradiance, centre_of(color), *facts, config.slope)
         value = value / sum(weight for _, weight in terms)
     else:
-        output = predict(model, batch, not config.float32, run)
+        output = cast(Filtered, predict(model, batch, not config.float32, run))
         value = losses.temporal_loss(loss, output, color, *facts, terms, config.slope)
     value = value / batch.error
     if neighbours:
