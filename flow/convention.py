@@ -212,10 +212,17 @@ class _Trials:
             readings = [reading for reading in readings if reading == assumed or reading in rank[:FINALISTS]]
         least = min(readings, key=self.mean)
         if "scale" not in settled:
-            fitted = self._fit_scale(least if self.good(least, EXACT) else self._fit_length(assumed, settled))
-            if self.overrules(fitted, least):
+            exact = self.good(least, EXACT)
+            fitted = self._fit_scale(least if exact else self._fit_length(assumed, settled))
+            # Two lengths that nobody has stated, and that are not exact, go behind one for both axes that fits better.
+            unlikely = not exact and least.unit != assumed.unit and self._axes(fitted) < self._axes(least)
+            if self.overrules(fitted, least) or (unlikely and self.mean(fitted) < self.mean(least)):
                 return fitted
         return next(reading for reading in readings if not self.clearly_better(least, reading))
+
+    def _axes(self, reading: MotionConvention) -> int:
+        """Count the lengths of a convention's unit: two where width and height of the picture are units."""
+        return len({abs(factor) for factor in reading.factors(self.screen.resolution)})
 
     def _readings(self, assumed: MotionConvention, settled: frozenset[str]) -> list[MotionConvention]:
         """Conventions with the settled parts and plausible lengths, the preferred ones first."""

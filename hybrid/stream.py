@@ -215,11 +215,13 @@ class FrameStream:
         plan = self.plan(numbers, self.context(denoised is not None, middle))
         forth: dict[int, Flow | None] = {}
         back: dict[int, Flow | None] = {}
+        samples = {number: 1.0}
         for side in (numbers[middle + 1 :], numbers[:middle][::-1]):
             before = number
             for n in side:
                 forth[n] = self._composed(forth, number, before, n)
                 back[n] = self._composed(back, number, before, n, reverse=True)
+                samples[n] = samples[before] * self._samples_beside(before, n)
                 before = n
         links = tuple(_link(forth.get(n), back.get(n)) for n in numbers)
         steps = [self._cache.get(("flows", pair)) for pair in pairwise(numbers)]
@@ -239,7 +241,15 @@ class FrameStream:
         )
         noise = least_outline_noise(self.measurements(numbers)[1]) or (0.0, 0.0)
         return Window(
-            frames, links, denoised, plan.stages, repeated, tuple(refined), noise, release=self.keeper.release
+            frames,
+            links,
+            denoised,
+            plan.stages,
+            repeated,
+            tuple(np.float32(min(samples[n], 1)) for n in numbers),
+            tuple(refined),
+            noise,
+            release=self.keeper.release,
         )
 
     def _composed(
@@ -252,6 +262,14 @@ class FrameStream:
         with self.timings.stage("flow"):
             composed = compose_flows(step, flows[before]) if reverse else compose_flows(flows[before], step)
         return self.keeper.keep(composed)
+
+    def _samples_beside(self, before: int, number: int) -> float:
+        """The samples of a frame over those of the one beside it; 1 where one of them is missing."""
+        earlier, later = sorted((before, number))
+        if not (self.shot.has(earlier) and self.shot.has(later)):
+            return 1.0
+        ratio = self._pair_facts(earlier, later).samples
+        return ratio if before == earlier else 1 / ratio
 
     # How each value is made.
 

@@ -297,8 +297,11 @@ def _warp_neighbours(
 
 
 def _set_trust(confidence: Array, coverage: Array, window: Window, index: int, trust: Trust, rows: slice) -> None:
-    """Write a neighbour's confidence and coverage, as far as its noise is its own."""
+    """Write a neighbour's confidence and coverage, as far as its samples count beside the centre's."""
     coverage[index], confidence[index] = trust
+    if window.samples[index] < 1:
+        coverage[index] *= window.samples[index]
+        confidence[index] *= window.samples[index]
     if window.repeated[index]:  # a frame nearer to the centre has the same samples
         coverage[index] = confidence[index] = 0
     elif "fixed-noise" in window.stages and (link := window.links[index]) is not None:

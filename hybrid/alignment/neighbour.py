@@ -83,7 +83,7 @@ def trust_light(
     *,
     agreeing: float = AGREEING,
 ) -> Array:
-    """Combine confidence c, coverage and gate g, each (T, h, W): max(c g, min(coverage, agreeing) g).
+    """Combine confidence c, coverage and gate g, each (T, h, W): max(c g, coverage · agreeing · g).
 
     Without the stage "gate" c stands for c g. `agreeing` is the confidence that geometry leaves at least where the
     light agrees.
@@ -104,7 +104,7 @@ def _combine(
         for y in range(first, last):
             for x in range(trust.shape[2]):
                 weight = gate[t, y, x]
-                floor = min(coverage[t, y, x], agreeing) * weight
+                floor = coverage[t, y, x] * agreeing * weight
                 # A factor and no condition, so that several pixels are computed at once.
                 shown = one if coverage[t, y, x] > zero else zero
                 trust[t, y, x] = max(confidence[t, y, x] * (weight if gated else one), floor) * shown

@@ -36,6 +36,7 @@ class Window:
     first_pass: tuple[Array | None, ...] | None  # (H, W, 3): denoised radiance of each frame; None without a first pass
     stages: frozenset[str]  # the stages that run
     repeated: tuple[bool, ...]  # whether a frame has the samples of the frame beside it on the side of the centre
+    samples: tuple[np.float32, ...]  # samples of each frame over those of the centre, at most 1
     # the shares of the picture on which TV-L1 corrected vectors, for all flows within the window
     refined: tuple[float, ...] = ()
     outline_noise: tuple[float, float] = (0.0, 0.0)  # the least of `measure.PairFacts` within the window

@@ -149,7 +149,7 @@ class ExrImage:
         base = re.sub(rf"[-_.]{re.escape(part.view or 'main')}$", "", part.name)
         *layer, component = name.split(".")
         own = ".".join(layer)
-        layer = [own] if own == base or own.startswith(base + ".") else [base, *layer]
+        layer = [own] if own in (base, part.name) or own.startswith(base + ".") else [base, *layer]
         if part.view and part.view not in ".".join(layer).split("."):
             layer.append(part.view)
         return ".".join([*layer, component])
@@ -184,6 +184,13 @@ class ExrImage:
         if self.views and any(layer.view is None and layer.name in left_out for layer in found):
             found = [replace(layer, view=layer.view or self.views[0]) for layer in found]
         return tuple(found)
+
+    @cached_property
+    def ending(self) -> str:
+        """The word that ends the names of all layers (``.main`` of ``rgba.main`` and ``albedo.main``); "" for none."""
+        names = {without_view(layer) for layer in self.layers} - {""}
+        ends = {match[0] if (match := re.search(r"[._ -][^._ -]+$", name)) else "" for name in names}
+        return ends.pop() if len(names) > 1 and len(ends) == 1 else ""
 
     @property
     def channel_names(self) -> tuple[str, ...]:

@@ -4,11 +4,12 @@ import fnmatch
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Self
 
 from flow.motion import MotionConvention
 from hybrid.files.exr import ExrError, ExrImage, Layer, component_of, without_view
-from hybrid.files.profile import ROLE_FACTS, ROLES, Profile, find_profile, plain_name
+from hybrid.files.profile import ROLE_FACTS, ROLES, Profile, find_profile, plain_name, read_profiles
 
 COMPOSITE = "Composite"  # Blender's name for its compositor's result: graded, blurred, glowing
 # Blender's names for the picture that it has denoised, beside its Noisy Image: in a render, and in the files of a File
@@ -204,8 +205,8 @@ def _find_any_color(image: ExrImage, profile: Profile, notes: list[str]) -> Laye
 
 def _find_denoised(image: ExrImage, color: Layer) -> Layer | None:
     """The picture that Cycles denoised, beside its Noisy Image."""
-    near = _same_group(image, color)
-    combined = [x for name in _DENOISED for x in near if name in _tails(image, x) and _group(x) == _group(color)]
+    near = [x for x in _same_group(image, color) if _group(image, x) == _group(image, color)]
+    combined = [x for name in _DENOISED for x in near if name in _tails(image, x)]
     return _fit(image, "estimate", combined[0], named=True) if combined else None
 
 
@@ -236,9 +237,10 @@ def find_colors(image: ExrImage, profile: Profile) -> list[Layer]:
     colors = []
     for view in image.views or (None,):
         named = _name_colors(image, profile, view, []) or _name_grays(image, profile, view)
-        groups = {_group(layer) for layer in named}
+        of = {layer: _group(image, layer) for layer in named}
+        groups = sorted({*of.values()})
         # Layers of no view layer beside those of one are no view of their own, but ambiguous.
-        split = [named] if "" in groups else [[x for x in named if _group(x) == group] for group in sorted(groups)]
+        split = [named] if "" in groups else [[x for x in named if of[x] == group] for group in groups]
         colors += [_only(image, "color", layers) for layers in split if layers]
     return list(dict.fromkeys(colors))
 
@@ -252,13 +254,14 @@ def _name_colors(image: ExrImage, profile: Profile, view: str | None, notes: lis
         fitting = {layer: fitted for layer in named if (fitted := _fit(image, "color", layer, named=True))}
         if not fitting:
             continue
-        groups = {_group(layer) for layer in fitting}
+        of = {layer: _group(image, layer) for layer in fitting}
+        groups = {*of.values()}
         if COMPOSITE in groups and len(groups) > 1:
-            notes += [f"{x} stays as it is: the compositor's" for x in fitting.values() if _group(x) == COMPOSITE]
+            notes += [f"{x} stays as it is: the compositor's" for layer, x in fitting.items() if of[layer] == COMPOSITE]
             groups.remove(COMPOSITE)
         chosen: list[Layer] = []
         for group in sorted(groups):
-            colors = {layer: fitted for layer, fitted in fitting.items() if _group(layer) == group}
+            colors = {layer: fitted for layer, fitted in fitting.items() if of[layer] == group}
             plain = {_tails(image, layer)[0] for layer in colors}
             if "noisyimage" in plain and plain <= {"noisyimage", *_DENOISED}:
                 colors = {x: fitted for x, fitted in colors.items() if "noisyimage" in _tails(image, x)}
@@ -276,7 +279,7 @@ def _find_guide(image: ExrImage, role: str, color: Layer, profile: Profile) -> L
         layers.append(({*_tails(image, layer)} - {""} | ({""} if bare else set()), layer))
         if not without_view(layer):  # a single bare channel may have a name too: depth, a
             layers += [({plain_name(c.rpartition(".")[2])}, replace(layer, channels=(c,))) for c in layer.channels]
-    near = [(tails, layer) for tails, layer in layers if _group(layer) == _group(color)]
+    near = [(tails, layer) for tails, layer in layers if _group(image, layer) == _group(image, color)]
     for name in profile.names(role):
         for scope in (near, layers):
             matching = [layer for tails, layer in scope if name in tails]
@@ -299,15 +302,15 @@ def _find_unused(image: ExrImage, color: Layer, found: Mapping[str, Layer | None
                 yield f"{layer} is not used; if it is the {role}: --layer {role}={layer.name or layer}"
 
 
-def _is_light(layer: Layer) -> bool:
+def _is_light(image: ExrImage, layer: Layer) -> bool:
     """Whether a layer has a name for light; its pixels decide what it is a part of (`hybrid.pass_sums`)."""
-    plain = plain_name(without_view(layer).rpartition(".")[2])
+    plain = _tails(image, layer)[0]
     return bool(_PASS.fullmatch(plain) or _LIGHT_GROUP.match(plain))
 
 
 def _find_lights(image: ExrImage, color: Layer, written: Sequence[Layer]) -> dict[str, Layer]:
     used = {channel for layer in written for channel in layer.channels}
-    lights = [x for x in _same_group(image, color) if _is_light(x) and not used & {*x.channels}]
+    lights = [x for x in _same_group(image, color) if _is_light(image, x) and not used & {*x.channels}]
     fitting = {without_view(x): _fit(image, "color", x, named=True) for x in lights}
     return {name: layer for name, layer in fitting.items() if layer is not None}
 
@@ -331,7 +334,7 @@ def _find_pass_colors(image: ExrImage, aovs: Mapping[str, Layer], color: Layer) 
     for name, light in aovs.items():
         named = {lobe + word for lobe in _lobes(image, light) for word in ("col", "color")}
         for layer in _same_group(image, color):
-            if named & {*_tails(image, layer)} and _group(layer) == _group(light):
+            if named & {*_tails(image, layer)} and _group(image, layer) == _group(image, light):
                 pass_colors[name] = replace(layer, channels=layer.channels[:3])
     return pass_colors
 
@@ -439,14 +442,14 @@ def _fit(image: ExrImage, role: str, layer: Layer, *, named: bool) -> Layer | No
     return _as_gray(layer) if named and role in ("albedo", "estimate") else None
 
 
-def _group(layer: Layer) -> str:
+def _group(image: ExrImage, layer: Layer) -> str:
     """The view layer that a layer belongs to, as Cycles names them; "" for none."""
-    return without_view(layer).rpartition(".")[0]
+    return _plain_path(image, layer).rpartition(".")[0]
 
 
 def _same_group(image: ExrImage, color: Layer) -> list[Layer]:
     """The layers of the color's view layer (or of none) and of its stereo view (or of none)."""
-    group = _group(color)
+    group = _group(image, color)
     view = color.view or (image.views[0] if image.views else None)
     return [
         layer
@@ -458,7 +461,20 @@ def _same_group(image: ExrImage, color: Layer) -> list[Layer]:
 def _paths(image: ExrImage, layer: Layer) -> list[str]:
     """The names of a layer: the qualified one, and the one inside its part."""
     own = image.own_name(layer.channels[0]).rpartition(".")[0]
-    return [without_view(layer), ".".join(token for token in own.split(".") if token != layer.view)]
+    return [_plain_path(image, layer), ".".join(token for token in own.split(".") if token != layer.view)]
+
+
+def _plain_path(image: ExrImage, layer: Layer) -> str:
+    """The name of a layer without its view, and without the word that ends all names, unless it names a layer."""
+    name, word = without_view(layer), plain_name(image.ending[1:])
+    return name if not word or _names_layer(word) else name.removesuffix(image.ending)
+
+
+@lru_cache(maxsize=64)
+def _names_layer(word: str) -> bool:
+    """Whether a plain name is that of a role or of a part of the light."""
+    named = any(word in profile.own_names(role) for profile in read_profiles().values() for role in ROLES)
+    return named or _PASS.fullmatch(word) is not None
 
 
 def _tails(image: ExrImage, layer: Layer) -> list[str]:

@@ -63,9 +63,11 @@ class Pattern:
             files[number] = path
         plain = replace(self, before=self.before.removesuffix("-"))
         signed = replace(self, before=f"{plain.before}-")
-        if not _sign(plain.before) and plain.path(0).exists() and signed.path(1).exists():
-            said = f"{signed.path(1).name} may be frame -1 of {plain} or frame 1 of {signed}"
-            raise ValueError(f"{self.folder}: {said}, expected a dot before the numbers, or two folders")
+        if not _sign(plain.before) and any(plain.number(path.name) is not None for path in names):
+            for path in names:
+                if (count := signed.number(path.name)) is not None:
+                    said = f"{path.name} may be frame {-count} of {plain} or frame {count} of {signed}"
+                    raise ValueError(f"{self.folder}: {said}, expected a dot before the numbers, or two folders")
         return files
 
     def number(self, name: str) -> int | None:
@@ -111,7 +113,7 @@ def find_files(spec: str) -> tuple[dict[int, Path], str | None]:
         if files := pattern.files():
             return files, frames
         # A range within the name, unless a file has that name.
-        match = re.fullmatch(rf"(.*?)((?:(?<![^._])-)?{_RANGE})", pattern.before)
+        match = re.fullmatch(rf"(.*?)((?:(?<![^\W_])-)?{_RANGE})", pattern.before)
         if match and "-" in match[2]:
             bare = Pattern(pattern.folder, match[1], pattern.digits, pattern.after)
             if files := bare.files():
@@ -237,8 +239,8 @@ def pattern_of(path: Path) -> Pattern:
 
 
 def _sign(before: str) -> str:
-    """A hyphen is a sign where it separates no name from its number: in a.-001.exr and -001.exr, not in a-001.exr."""
-    return "-?" if not before or before.endswith((".", "_")) else ""
+    """A hyphen is a sign where it separates no name from its number: in a.-001, a -001 and -001, not in a-001."""
+    return "" if before[-1:].isalnum() else "-?"
 
 
 def _only(patterns: list[Pattern], spec: str, folder: Path) -> Pattern:

@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -84,17 +84,17 @@ def find_companions(
 def _find_elements(
     color: Pattern, files: Mapping[int, Path], named: Collection[str]
 ) -> tuple[Profile | None, list[SidecarSequence]]:
-    """Guides in the color's folder, a sequence each, under its name and their own (``view.normals.####.exr``)."""
-    elements = [(plain_name(rest), p) for p in list_patterns(color.folder) if (rest := _rest(p, color))]
-    if not color.digits or not elements:
+    """Guides in the color's folder, a sequence each, under names of their own (`_label_beside`)."""
+    for sequences in _label_beside(color) if color.digits else ():
+        assigned = _assign(sequences)
+        if assigned is not None and (("", color) in sequences or color in assigned[1]["color"]):
+            break
+    else:
         return None, []
     try:
         image = read_exr(files[min(files)], pixels=False)
         known = find_layers(image)
     except (ExrError, OSError):  # raised again when the layers are needed
-        return None, []
-    assigned = _assign([("", color), *elements])
-    if assigned is None:
         return None, []
     profile, roles = assigned
     wanted = {role for role in GUIDES if role not in named and getattr(known, role) is None}
@@ -102,6 +102,20 @@ def _find_elements(
     sidecars = _only_each(color.folder, missing)
     why = f"{', '.join(other.spec for other in sidecars)} beside it"
     return (_profile_of(image, profile, why) if sidecars else None), sidecars
+
+
+def _label_beside(color: Pattern) -> Iterator[list[tuple[str, Pattern]]]:
+    """The color and the sequences in its folder, labeled by their own parts of their names.
+
+    First those that begin with all of its name (``view.####.exr``, ``view.normals.####.exr``), then those that share
+    less and less of its words (``sh_RGB.####.exr``, ``sh_ALBEDO.####.exr``).
+    """
+    beside = [p for p in list_patterns(color.folder) if (p.before, p.after) != (color.before, color.after)]
+    yield [("", color), *((plain_name(rest), p) for p in beside if (rest := _rest(p, color)))]
+    stem = _stem(color)
+    for start in sorted({0, *(match.end() for match in re.finditer("[._-]", stem))}, reverse=True):
+        others = [p for p in beside if _stem(p).startswith(stem[:start]) and p.after == color.after]
+        yield [(plain_name(_stem(p)[start:]), p) for p in (color, *others)]
 
 
 def gather_folder(folder: Path) -> tuple[dict[int, Path], Profile, list[SidecarSequence]] | None:

@@ -145,6 +145,14 @@ def test_gray_and_direction_with_length_are_told_by_their_values() -> None:
     assert (gray.convention.direction, gray.convention.encoding) == ("next", "gray")
     assert gray.convention.scale == pytest.approx(32, rel=0.02)
 
+    film = Film((2, 4), 0.06, frames=2)
+    gray = choose_convention(film.pairs(lambda n: np.float32(0.5 + 0.5 * film.next(n) / 56)), PLAIN, ())
+    assert gray.convention is not None
+    # Half the picture, 70 and 45 pixels, was preferred; of two frames the length is known to a fiftieth or two.
+    assert gray.convention.factors((HEIGHT, WIDTH)) == pytest.approx((56, 56), rel=0.04)
+
+    film = Film(**MOVES, faster=1.5)
+
     def magnitude(n: int) -> np.ndarray:
         v = film.next(n) / np.float32([WIDTH, HEIGHT])
         length = np.linalg.norm(v, axis=-1, keepdims=True)

@@ -101,6 +101,31 @@ def test_parts_that_are_named_after_the_only_view(tmp_path, end):
     assert find_layers(image, {"color": f"rgba{end}"}).color == layers.color
 
 
+@pytest.mark.parametrize("word", ["main", "MAIN", "left", "v2"])
+@pytest.mark.parametrize("separator", "._- ")
+@pytest.mark.parametrize("kind", ["parts", "qualified parts", "one part"])
+def test_one_word_behind_the_names_of_all_layers(tmp_path, word, separator, kind):
+    """Guides of such files were left out, in some spellings without a word."""
+    layers = {
+        f"{n}{separator}{word}": c for n, c in {"rgba": "RGBA", "albedo": "RGB", "N": "XYZ", "depth": "Z"}.items()
+    }
+    own = {n: planes([c if kind == "parts" else f"{n}.{c}" for c in channels]) for n, channels in layers.items()}
+    one = {name: plane for part in own.values() for name, plane in part.items()}
+    path = save(tmp_path / "a.exr", one) if kind == "one part" else save_parts(tmp_path / "a.exr", own)
+    found = find_layers(read_exr(path, pixels=False))
+    names = [getattr(found, role).name for role in ("color", "albedo", "normal", "depth", "alpha")]
+    assert [name.split(separator)[0] for name in names] == ["rgba", "albedo", "N", "depth", "rgba"]
+    assert found.notes == ()
+    assert find_layers(read_exr(path, pixels=False), {"color": f"rgba{separator}{word}"}).color == found.color
+
+
+def test_a_word_behind_all_names_that_names_a_layer_is_no_ending(tmp_path):
+    """Two view layers with nothing but their pictures are two colors still."""
+    image = headers(tmp_path, [f"{layer}.Combined.{c}" for layer in ("ViewLayer", "Second") for c in "RGBA"])
+    with pytest.raises(ExrError, match="color can be"):
+        find_layers(image)
+
+
 def test_layers_that_look_like_guides_and_are_not_taken_are_named(tmp_path):
     """They were left unused without a word."""
     names = "R G B N_mine.X N_mine.Y N_mine.Z myAlbedo.R myAlbedo.G myAlbedo.B Z_mine.Z world_velocity.X albedo_mse.R"

@@ -168,7 +168,7 @@ def test_negative_numbers_with_nothing_before_them(tmp_path):
         find_files(f"{tmp_path}/-####.exr")
 
 
-@pytest.mark.parametrize("before", ["a.", "shot_", "", "v2_"])
+@pytest.mark.parametrize("before", ["a.", "shot_", "", "v2_", "foo ", "foo-", "foo("])
 @pytest.mark.parametrize("form", ["-{:04d}", "-{:03d}", "-{:d}"])
 @pytest.mark.parametrize("least", [0, 1, 9])
 def test_signs_beside_numbers_of_any_width(tmp_path, before, form, least):
@@ -198,7 +198,11 @@ def test_a_hyphen_that_may_be_a_sign_is_refused(tmp_path):
             find_files(f"{tmp_path}/{spec}")
     with pytest.raises(ValueError, match=r"several sequences.*shot####\.exr"):
         find_files(str(tmp_path))
-    (tmp_path / "shot0000.exr").unlink()
+    (tmp_path / "shot0000.exr").unlink()  # of every second frame none may be 0
+    for spec in ("shot####.exr", "shot-####.exr"):
+        with pytest.raises(ValueError, match=r"shot-0001\.exr may be frame -1 of shot####\.exr or frame 1 of"):
+            find_files(f"{tmp_path}/{spec}")
+    (tmp_path / "shot0001.exr").unlink()
     assert list(find_files(f"{tmp_path}/shot-####.exr")[0]) == [1, 2]
 
 

@@ -10,8 +10,9 @@ import pytest
 
 from hybrid.cli import main
 from hybrid.files.exr import ExrError, read_exr
+from hybrid.files.sequences import pattern_of
 from hybrid.files.shots import open_shot
-from hybrid.files.sidecars import names_sequence
+from hybrid.files.sidecars import find_companions, names_sequence
 from tests.renderers import Channels, Truth, cycles_vector, layer, save, truths
 
 FRAMES = truths()
@@ -193,9 +194,19 @@ def test_renderers_that_write_a_file_for_each_output(profile: str, names: dict[s
         for role, channels in {"color": color(truth), **others(truth)}.items():
             if role in names:
                 save(tmp_path / names[role].replace("####", f"{truth.number:04d}"), channels)
-    layers = open_shot(tmp_path).layers(10)
-    assert layers.profile == profile
-    assert {role for role in ROLES if getattr(layers, role) is not None} == {*names} - {"color"}
+    # Named alone the color lost its albedo, without a hint.
+    for spec in (tmp_path, tmp_path / names["color"], tmp_path / names["color"].replace("####", "0010")):
+        layers = open_shot(spec).layers(10)
+        assert layers.profile == profile
+        assert {role for role in ROLES if getattr(layers, role) is not None} == {*names} - {"color"}
+    assert find_companions(pattern_of(tmp_path / names["depth"].replace("####", "0010")).files()) == (None, [])
+
+
+def test_each_color_of_a_folder_has_its_own_guides(tmp_path: Path) -> None:
+    for shot in ("a", "b"):
+        split(tmp_path, {role: f"{shot}_{role}.####.exr" for role in ROLES} | {"color": f"{shot}_beauty.####.exr"})
+    layers = open_shot(tmp_path / "b_beauty.####.exr").layers(10)
+    assert [getattr(layers, role).file for role in ROLES] == [f"b_{role}.####.exr" for role in ROLES]
 
 
 def test_a_layer_that_was_made_again_makes_the_frame_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
