@@ -15,6 +15,7 @@ from hybrid.files.sequences import format_frames
 
 #: Stages by name, in order. A figure calls for some; others (`_switch`) run wherever their input is there.
 STAGES = {
+    "whiten": "undo the renderer's pixel filter, by which neighbouring pixels share noise, and apply it to the result",
     "fireflies": "remove single bright samples of a frame before anything spreads them",
     "demodulate": "divide by the albedo and filter the light alone",
     "outliers": "reject samples far above the aligned window",
@@ -37,6 +38,9 @@ STAGES = {
 OLD_NAMES = {"steady": "stabilize", "mean": "restore-mean", "samples": "blend-samples"}
 NEURAL_STAGES = frozenset({"clean-guides", "stabilize", "alpha", "skip"})  # stages of networks alone
 
+# Correlation of neighbouring pixels' noise: that of independent noise is measured as 0.1 at most, as changes of a clean
+# picture add to it, on forty shots; a tent of two pixels leaves 0.17.
+WHITEN_ABOVE = 0.13
 STILL = 0.05  # motion below a twentieth of a pixel blurs a bilinear sample by less than 1 % of its contrast
 # Share of pixels, in areas of 9×9, whose brightness the vectors do not explain. Refinement is worth its time for
 # reflections and shadows of some size; the gate is cheap and already pays for a small highlight.
@@ -124,6 +128,10 @@ class Rules:
         """The forced stages as text: +warp -gate."""
         return " ".join([*(f"+{name}" for name in sorted(self.on)), *(f"-{name}" for name in sorted(self.off))])
 
+    def whitens(self, correlation: float | None) -> bool:
+        """Whether the pixel filter of a frame is undone whose noise has this correlation (`measure_correlation`)."""
+        return correlation is not None and self._applied(_decide_whiten([correlation]), (), NOISY).on
+
     def decide(self, frames: Sequence[FrameFacts], pairs: Sequence[PairFacts], context: Context = NOISY) -> Plan:
         """Decide the stages of a window, from the facts of its frames that are there, and of all neighbours among them.
 
@@ -180,6 +188,7 @@ def measure_stages(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> 
         not pairs or max(frame.noise for frame in frames) > FEW_SAMPLES,
     )
     decisions = (
+        _decide_whiten([frame.noise_correlation for frame in frames]),
         _switch("fireflies", fireflies > 0, f"{fireflies} single bright samples"),
         # With one constant albedo this changes nothing; neighbouring frames may have another.
         _switch("demodulate", spread is not None, albedo),
@@ -226,6 +235,13 @@ def _decide(stage: str, figure: float, threshold: float, words: str) -> Decision
 
 def _switch(stage: str, on: bool, reason: str) -> Decision:
     return Decision(stage, on, None, None, reason)
+
+
+def _decide_whiten(figures: Sequence[float | None]) -> Decision:
+    known = [figure for figure in figures if figure is not None]
+    if not known:
+        return Decision("whiten", False, None, WHITEN_ABOVE, "no two neighbouring frames whose noise can be compared")
+    return _decide("whiten", max(known), WHITEN_ABOVE, "the noise of neighbouring pixels correlates by {:.2f}")
 
 
 def _decide_warp(pairs: Sequence[PairFacts], vectors: bool, moves: bool, speed: float, changed: float) -> Decision:

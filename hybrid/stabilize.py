@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from flow.warp import warp
 from hybrid.alignment.align import align, align_results, measure_stillness
-from hybrid.alignment.prepare import PreparedFrame
+from hybrid.alignment.prepare import ALPHA, PreparedFrame
 from hybrid.alignment.transfer import measure_typical_exposure
 from hybrid.alignment.unfiltered import as_gray
 from hybrid.alignment.window import AlignedWindow, Trust, Window
@@ -24,6 +24,7 @@ from nlm.average import average, channel_mean
 from nlm.fireflies import Highlights, add_highlights
 from nlm.moving_lights import CONTENT, LEAST, confirmed_by_neighbour, find_bright, passing_lights, trail_of
 from nlm.parts import limit_change
+from nlm.pixel_filter import PixelFilter
 from nlm.samples import SampleMean, beside_lamps, blend_samples, limit_lamps, restore_mean
 
 Array = NDArray[np.float32]
@@ -163,6 +164,8 @@ class FrameDenoiser:
             denoised = self._correct(denoised, frame, result, moving)
             if frame.highlights is not None:
                 denoised = _with_highlights(denoised, frame.highlights)
+            if frame.spread is not None:
+                denoised = _with_filter(denoised, frame.spread)
             denoised, beyond = _with_unfiltered(denoised, frame), frame.unfiltered.count
         return FrameResult(
             denoised,
@@ -429,6 +432,13 @@ def _with_highlights(denoised: Denoised, highlights: Highlights) -> Denoised:
         for layers in (denoised.aovs, denoised.extra)
     )
     return replace(denoised, color=color, aovs=aovs, extra=extra)
+
+
+def _with_filter(denoised: Denoised, spread: PixelFilter) -> Denoised:
+    """The picture, its parts and all other light as the renderer's pixel filter makes it."""
+    aovs = {name: layer if name == ALPHA else spread.apply(layer) for name, layer in denoised.aovs.items()}
+    extra = {n: spread.apply(layer) if n in denoised.parts else layer for n, layer in denoised.extra.items()}
+    return replace(denoised, color=np.maximum(spread.apply(denoised.color), 0), aovs=aovs, extra=extra)
 
 
 def _with_unfiltered(denoised: Denoised, frame: PreparedFrame) -> Denoised:

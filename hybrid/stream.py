@@ -27,11 +27,12 @@ from hybrid.alignment.measure import (
     least_outline_noise,
     measure_frame,
     measure_pair,
+    noise_correlation,
     relit,
     scaled,
     shrink,
 )
-from hybrid.alignment.prepare import PreparedFrame, prepare, prepared_planes
+from hybrid.alignment.prepare import PreparedFrame, prepare, prepared_planes, without_filter
 from hybrid.alignment.residual import Limited, measure_limited
 from hybrid.alignment.unfiltered import find_region, mirror_region
 from hybrid.alignment.window import AlignedWindow, Window
@@ -41,11 +42,15 @@ from hybrid.files.shots import Shot
 from hybrid.plan import DENOISED, NOISY, RADIUS, Context, Plan, Rules, merge
 from hybrid.runtime.kept import Keeper
 from hybrid.runtime.timing import Timings
+from loops.parallel import Doubles
+from nlm.pixel_filter import find_filter
 
 Value = TypeVar("Value")
 
 # A frame with less than this share of another's light is black beside it: half floats hold no more of it.
 FAINT = 1e-6
+# Kinds of values that are kept for frames beyond those of a window.
+BEYOND = "read", "raw", "rendered", "correlation", "same noise"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,11 +104,11 @@ class FrameStream:
         kept = {*numbers}
         loaded = [frames[0] for kind, frames in self._cache if kind == "frame" and frames[0] in kept]
         first = max(loaded, default=min(kept)) - (REACH - 1) * self.shot.step
-        last = max(kept) + REACH * self.shot.step
+        last = max(kept) + (REACH + 1) * self.shot.step
         self._cache = {
             (kind, frames): value
             for (kind, frames), value in self._cache.items()
-            if (first <= frames[0] <= last if kind in ("read", "rendered", "same noise") else kept.issuperset(frames))
+            if (first <= frames[0] <= last if kind in BEYOND else kept.issuperset(frames))
         }
 
     def around(self, number: int, radius: int | None = None) -> list[int]:
@@ -128,7 +133,12 @@ class FrameStream:
         if ("read", (number,)) not in self._cache:
             self._read(number)
         frame = cast(Frame, self._cache["read", (number,)])
-        return frame if prepared is self.rendered(number) else replace(frame, color=prepared.radiance)
+        if prepared.spread is not None:
+            estimate = frame.estimate if frame.estimate is None else prepared.spread.undo(frame.estimate)
+            frame = replace(frame, albedo=prepared.albedo, normal=prepared.normal, estimate=estimate)
+        elif prepared is self.rendered(number):
+            return frame
+        return replace(frame, color=prepared.radiance)
 
     def denoised(self, number: int) -> Array | None:
         """The first pass of a frame, radiance (H, W, 3); None where there is none."""
@@ -138,7 +148,10 @@ class FrameStream:
 
         def make(number: int) -> Array | None:
             self.keeper.trim()
-            return source.make(self, number)
+            picture, spread = source.make(self, number), self._there(number).spread
+            # All others are made of frames without the filter.
+            finished = source.files is not None and picture is not None and spread is not None
+            return np.maximum(spread.undo(picture), 0) if finished else picture
 
         denoised = self._cached("first pass", (number,), make)
         self._cache.pop(("read", (number,)), None)
@@ -272,7 +285,32 @@ class FrameStream:
 
     def rendered(self, number: int) -> PreparedFrame | None:
         """A frame with its fireflies; None where the shot has none."""
-        return self._cached("rendered", (number,), self._read) if self.shot.has(number) else None
+        return self._cached("rendered", (number,), self._without_filter) if self.shot.has(number) else None
+
+    def _without_filter(self, number: int) -> PreparedFrame:
+        """A frame, in which the pixel filter of its noise is undone if the stage runs."""
+        frame, correlation = self._raw(number), self._correlation(number)
+        if correlation is None or not self.rules.whitens(_least(correlation)):
+            return frame
+        with self.timings.stage("whiten"):
+            return without_filter(frame, find_filter(correlation))
+
+    def _raw(self, number: int) -> PreparedFrame:
+        return self._cached("raw", (number,), self._read)
+
+    def _correlation(self, number: int) -> Doubles | None:
+        """The correlation of a frame's noise, the mean over its pairs with the frames beside it; None if unknown."""
+        if "whiten" not in self.rules.allowed:
+            return None
+        pairs = [pair for pair in pairwise(self.around(number, 1)) if all(map(self.shot.has, pair))]
+        found = [self._cached("correlation", pair, self._measure_correlation) for pair in pairs]
+        known = [correlation for correlation in found if correlation is not None]
+        return np.mean(known, axis=0) if known else None
+
+    def _measure_correlation(self, a: int, b: int) -> Doubles | None:
+        first, second = self._raw(a), self._raw(b)
+        with self.timings.stage("plan"):
+            return noise_correlation(first, second)
 
     def same_noise(self, a: int, b: int) -> float:
         """The share of the noise of two neighbouring frames, ascending, that is the same at equal pixels."""
@@ -305,8 +343,10 @@ class FrameStream:
         frame = self._there(number)
 
         def measure(n: int) -> FrameFacts:
+            correlation = self._correlation(n)
             with self.timings.stage("plan"):
-                return measure_frame(frame, self._small(n))
+                facts = measure_frame(frame, self._small(n))
+            return facts if correlation is None else replace(facts, noise_correlation=_least(correlation))
 
         return self._cached("frame facts", (number,), measure)
 
@@ -379,6 +419,11 @@ class FrameStream:
         frame = self.frame(number)
         assert frame is not None
         return frame
+
+
+def _least(correlation: Doubles) -> float:
+    """The correlation of neighbouring pixels along x or y, whichever is less: a filter spreads noise along both."""
+    return float(correlation[:, 0].min())
 
 
 def kept_planes(

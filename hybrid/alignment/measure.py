@@ -17,6 +17,7 @@ from hybrid.files.frame import Array
 from loops.parallel import Doubles, Mask, Places
 from nlm.average import channel_mean, reject_outliers
 from nlm.gate import color_gate
+from nlm.pixel_filter import measure_correlation
 from nlm.variance import second_differences
 
 # Rows to which frames are reduced for measuring: a mean of k×k pixels has a k-th of their noise, and a k²-th of their
@@ -36,6 +37,8 @@ GRAIN = 4 * NEAR
 # Means of 9×9 pixels of guides that differ by more, in units of albedo, show other surfaces; depth of field leaves
 # noise of 0.05 in a pixel, and a tenth of it in these means.
 GUIDE_CHANGE = 0.02
+# Guides of a pixel that differ by more, in units of albedo, show other surfaces, or more noise than the light has.
+SAME_SURFACE = 0.1
 # Every so many rows are looked at for noise of a frame: all take a tenth of a second at 1920×1080.
 GRAIN_ROWS = 16
 # Rows that are compared together for noise of guides at outlines, of `SmallFrame.factor` times as many.
@@ -103,6 +106,8 @@ class FrameFacts:
     transparent: float | None  # share of the pixels whose alpha is below 0.999
     noise_free: float  # share of the tiles without noise, in [0, 1]
     samples: float | None  # samples per pixel, if known
+    # correlation of the noise of neighbouring pixels along x or y, whichever is less; None if unknown
+    noise_correlation: float | None = None
 
 
 @dataclass(frozen=True)
@@ -292,6 +297,28 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool, same:
         shares.append(int(moved.sum()))
         figures.append(2 * correlation(*d))
     return float(np.clip(np.average(figures, weights=shares), -1, 1)) if figures else 0.0
+
+
+def noise_correlation(here: PreparedFrame, there: PreparedFrame) -> Doubles | None:
+    """Correlation of the noise of two neighbours (`nlm.pixel_filter.measure_correlation`); None where it is unknown.
+
+    Frames are compared along whole pixels of the vectors, in the middle of the picture, where their guides agree.
+    """
+    block = _middle(here.irradiance.shape[:2])
+    rows, columns = (places[block] for places in np.indices(here.valid.shape))
+    vectors = rendered_flow(here, there)
+    trusted = here.valid[block].copy()
+    if vectors is not None:
+        moved = np.rint(np.where(vectors[1][block][..., None], vectors[0][block], np.float32(-1e6))).astype(np.intp)
+        columns, rows = columns + moved[..., 0], rows + moved[..., 1]
+        height, width = here.valid.shape
+        trusted &= (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+        rows, columns = rows.clip(0, height - 1), columns.clip(0, width - 1)
+    trusted &= there.valid[rows, columns]
+    for guide, other in _guides(here, there):
+        trusted &= np.abs(guide[block] - other[rows, columns]).max(axis=-1) < SAME_SURFACE
+    first, second = channel_mean(here.irradiance[block]), channel_mean(there.irradiance[rows, columns])
+    return measure_correlation(first - second, trusted, GRAIN * np.maximum(np.abs(first), np.abs(second)))
 
 
 def _equal_share(a: Array, b: Array, compared: Mask, same: float) -> float:

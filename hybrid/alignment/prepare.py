@@ -1,6 +1,6 @@
 """Prepared frames: finite, divided by their albedo, with the renderer's vectors in our convention."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -17,6 +17,7 @@ from loops.parallel import Doubles, Mask, Places
 from nlm.average import reject_outliers, replace_nonfinite
 from nlm.fireflies import Highlights, add_highlights
 from nlm.guided import guided_filter, measure_guide
+from nlm.pixel_filter import PixelFilter
 
 Values = TypeVar("Values", bound=NDArray[Any])
 
@@ -61,6 +62,8 @@ class PreparedFrame:
     # persistent highlights: lights of a pixel that other frames show as well, averaged over these frames. They are not
     # in `irradiance`, and are added to the finished picture.
     highlights: Highlights | None = None
+    # the pixel filter that is undone in the light and the guides, and applied to the finished picture
+    spread: PixelFilter | None = None
 
     @cached_property
     def light(self) -> Array:
@@ -179,6 +182,32 @@ def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
         pass_colors=pass_colors,
         passes=passes,
         samples=frame.samples,
+    )
+
+
+def without_filter(frame: PreparedFrame, spread: PixelFilter) -> PreparedFrame:
+    """Undo a pixel filter in the light and the guides of a frame, as rendered.
+
+    The quotient of color and albedo is that of both without the filter. Light may be negative beside what is bright.
+    """
+    albedo, normal = (None if layer is None else spread.undo(layer) for layer in (frame.albedo, frame.normal))
+    albedo = None if albedo is None else np.maximum(albedo, 0)
+
+    def undo(layer: Array, textured: bool) -> Array:
+        if not textured or frame.albedo is None or albedo is None:
+            return spread.undo(layer)
+        return demodulate(spread.undo(remodulate(layer, frame.albedo)), albedo)
+
+    return replace(
+        frame,
+        irradiance=undo(frame.irradiance, frame.demodulated),
+        albedo=albedo,
+        normal=normal,
+        variance=None if frame.variance is None else frame.variance * np.float32(spread.gain),
+        spread=spread,
+        aovs={
+            name: undo(layer, frame.demodulated and name in frame.passes.textured) for name, layer in frame.aovs.items()
+        },
     )
 
 
