@@ -38,9 +38,13 @@ STAGES = {
 OLD_NAMES = {"steady": "stabilize", "mean": "restore-mean", "samples": "blend-samples"}
 NEURAL_STAGES = frozenset({"clean-guides", "stabilize", "alpha", "skip"})  # stages of networks alone
 
-# Correlation of neighbouring pixels' noise: that of independent noise is measured as 0.1 at most, as changes of a clean
-# picture add to it, on forty shots; a tent of two pixels leaves 0.17.
+# Correlation of the noise of neighbouring pixels, along x or y, whichever is less: as changes of a clean picture add to
+# it, up to 0.1 is measured for independent noise, on forty shots; the narrowest tent leaves 0.17.
 WHITEN_ABOVE = 0.13
+# The same of pixels three or four apart, whichever is most: 0.02 by the filters of renderers, 0.06 by wider ones that can
+# be undone in part; errors of denoised pictures have 0.12 and more.
+WHITEN_BELOW = 0.1
+Correlation = Sequence[Sequence[float]]
 STILL = 0.05  # motion below a twentieth of a pixel blurs a bilinear sample by less than 1 % of its contrast
 # Share of pixels, in areas of 9×9, whose brightness the vectors do not explain. Refinement is worth its time for
 # reflections and shadows of some size; the gate is cheap and already pays for a small highlight.
@@ -128,8 +132,8 @@ class Rules:
         """The forced stages as text: +warp -gate."""
         return " ".join([*(f"+{name}" for name in sorted(self.on)), *(f"-{name}" for name in sorted(self.off))])
 
-    def whitens(self, correlation: float | None) -> bool:
-        """Whether the pixel filter of a frame is undone whose noise has this correlation (`measure_correlation`)."""
+    def whitens(self, correlation: Correlation | None) -> bool:
+        """Whether the pixel filter of a frame is undone whose noise has this correlation (2, 4)."""
         return correlation is not None and self._applied(_decide_whiten([correlation]), (), NOISY).on
 
     def decide(self, frames: Sequence[FrameFacts], pairs: Sequence[PairFacts], context: Context = NOISY) -> Plan:
@@ -237,11 +241,16 @@ def _switch(stage: str, on: bool, reason: str) -> Decision:
     return Decision(stage, on, None, None, reason)
 
 
-def _decide_whiten(figures: Sequence[float | None]) -> Decision:
-    known = [figure for figure in figures if figure is not None]
+def _decide_whiten(correlations: Sequence[Correlation | None]) -> Decision:
+    known = [(min(lags[0] for lags in c), max(max(lags[2:]) for lags in c)) for c in correlations if c is not None]
     if not known:
         return Decision("whiten", False, None, WHITEN_ABOVE, "no two neighbouring frames whose noise can be compared")
-    return _decide("whiten", max(known), WHITEN_ABOVE, "the noise of neighbouring pixels correlates by {:.2f}")
+    near, far = max(known, key=lambda figures: (figures[1] < WHITEN_BELOW, figures[0]))
+    decision = _decide("whiten", near, WHITEN_ABOVE, "the noise of neighbouring pixels correlates by {:.2f}")
+    if not decision.on or far < WHITEN_BELOW:
+        return decision
+    why = f"and that of pixels three apart by {far:.2f}: no pixel filter that can be undone; a narrower one keeps detail"
+    return replace(decision, on=False, reason=f"{decision.reason}, {why}")
 
 
 def _decide_warp(pairs: Sequence[PairFacts], vectors: bool, moves: bool, speed: float, changed: float) -> Decision:

@@ -24,7 +24,6 @@ from nlm.average import average, channel_mean
 from nlm.fireflies import Highlights, add_highlights
 from nlm.moving_lights import CONTENT, LEAST, confirmed_by_neighbour, find_bright, passing_lights, trail_of
 from nlm.parts import limit_change
-from nlm.pixel_filter import PixelFilter
 from nlm.samples import SampleMean, beside_lamps, blend_samples, limit_lamps, restore_mean
 
 Array = NDArray[np.float32]
@@ -165,7 +164,7 @@ class FrameDenoiser:
             if frame.highlights is not None:
                 denoised = _with_highlights(denoised, frame.highlights)
             if frame.spread is not None:
-                denoised = _with_filter(denoised, frame.spread)
+                denoised = _with_filter(denoised, frame)
             denoised, beyond = _with_unfiltered(denoised, frame), frame.unfiltered.count
         return FrameResult(
             denoised,
@@ -434,11 +433,11 @@ def _with_highlights(denoised: Denoised, highlights: Highlights) -> Denoised:
     return replace(denoised, color=color, aovs=aovs, extra=extra)
 
 
-def _with_filter(denoised: Denoised, spread: PixelFilter) -> Denoised:
+def _with_filter(denoised: Denoised, frame: PreparedFrame) -> Denoised:
     """The picture, its parts and all other light as the renderer's pixel filter makes it."""
-    aovs = {name: layer if name == ALPHA else spread.apply(layer) for name, layer in denoised.aovs.items()}
-    extra = {n: spread.apply(layer) if n in denoised.parts else layer for n, layer in denoised.extra.items()}
-    return replace(denoised, color=np.maximum(spread.apply(denoised.color), 0), aovs=aovs, extra=extra)
+    aovs = {name: layer if name == ALPHA else frame.with_filter(layer) for name, layer in denoised.aovs.items()}
+    extra = {n: frame.with_filter(layer) if n in denoised.parts else layer for n, layer in denoised.extra.items()}
+    return replace(denoised, color=frame.with_filter(denoised.color), aovs=aovs, extra=extra)
 
 
 def _with_unfiltered(denoised: Denoised, frame: PreparedFrame) -> Denoised:

@@ -49,8 +49,6 @@ Value = TypeVar("Value")
 
 # A frame with less than this share of another's light is black beside it: half floats hold no more of it.
 FAINT = 1e-6
-# Kinds of values that are kept for frames beyond those of a window.
-BEYOND = "read", "raw", "rendered", "correlation", "same noise"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,11 +103,14 @@ class FrameStream:
         loaded = [frames[0] for kind, frames in self._cache if kind == "frame" and frames[0] in kept]
         first = max(loaded, default=min(kept)) - (REACH - 1) * self.shot.step
         last = max(kept) + (REACH + 1) * self.shot.step
-        self._cache = {
-            (kind, frames): value
-            for (kind, frames), value in self._cache.items()
-            if (first <= frames[0] <= last if kind in BEYOND else kept.issuperset(frames))
-        }
+
+        def is_kept(kind: str, frames: tuple[int, ...]) -> bool:
+            if kind == "raw":  # the noise of a frame is compared with that of the next one, and then no more
+                return max(loaded, default=first) <= frames[0] <= last
+            beyond = kind in ("read", "rendered", "correlation", "same noise")
+            return first <= frames[0] <= last if beyond else kept.issuperset(frames)
+
+        self._cache = {key: value for key, value in self._cache.items() if is_kept(*key)}
 
     def around(self, number: int, radius: int | None = None) -> list[int]:
         """Numbers of the window around a frame, ascending, whether or not these frames are there."""
@@ -290,22 +291,22 @@ class FrameStream:
     def _without_filter(self, number: int) -> PreparedFrame:
         """A frame, in which the pixel filter of its noise is undone if the stage runs."""
         frame, correlation = self._raw(number), self._correlation(number)
-        if correlation is None or not self.rules.whitens(_least(correlation)):
+        if correlation is None or not self.rules.whitens(correlation):
             return frame
         with self.timings.stage("whiten"):
-            return without_filter(frame, find_filter(correlation))
+            return without_filter(frame, find_filter(np.array(correlation)))
 
     def _raw(self, number: int) -> PreparedFrame:
         return self._cached("raw", (number,), self._read)
 
-    def _correlation(self, number: int) -> Doubles | None:
+    def _correlation(self, number: int) -> tuple[tuple[float, ...], ...] | None:
         """The correlation of a frame's noise, the mean over its pairs with the frames beside it; None if unknown."""
         if "whiten" not in self.rules.allowed:
             return None
         pairs = [pair for pair in pairwise(self.around(number, 1)) if all(map(self.shot.has, pair))]
         found = [self._cached("correlation", pair, self._measure_correlation) for pair in pairs]
         known = [correlation for correlation in found if correlation is not None]
-        return np.mean(known, axis=0) if known else None
+        return tuple(map(tuple, np.mean(known, axis=0).tolist())) if known else None
 
     def _measure_correlation(self, a: int, b: int) -> Doubles | None:
         first, second = self._raw(a), self._raw(b)
@@ -345,8 +346,7 @@ class FrameStream:
         def measure(n: int) -> FrameFacts:
             correlation = self._correlation(n)
             with self.timings.stage("plan"):
-                facts = measure_frame(frame, self._small(n))
-            return facts if correlation is None else replace(facts, noise_correlation=_least(correlation))
+                return replace(measure_frame(frame, self._small(n)), noise_correlation=correlation)
 
         return self._cached("frame facts", (number,), measure)
 
@@ -421,11 +421,6 @@ class FrameStream:
         return frame
 
 
-def _least(correlation: Doubles) -> float:
-    """The correlation of neighbouring pixels along x or y, whichever is less: a filter spreads noise along both."""
-    return float(correlation[:, 0].min())
-
-
 def kept_planes(
     shot: Shot, stages: Collection[str], first_pass: FirstPass | None, radius: int, *, filters_guides: bool = False
 ) -> float:
@@ -434,8 +429,9 @@ def kept_planes(
     guides = 1.5 * ((layers.albedo is not None) + (layers.normal is not None))  # in half precision
     filtered = guides if filters_guides and "clean-guides" in stages else 0.0
     support = radius if first_pass is None else first_pass.reach(radius)
-    # Fireflies are looked for in frames beyond the window.
-    frames = min(2 * support + 1 + (REACH if "fireflies" in stages else 0), len(shot.files))
+    # Fireflies are looked for in frames beyond the window, whose noise is compared with that of the next one.
+    beyond = (REACH if "fireflies" in stages else 0) + ("whiten" in stages)
+    frames = min(2 * support + 1 + beyond, len(shot.files))
     results = 2 if "stabilize" in stages else 1
     # With the neighbours' samples, trust, drift and excess; of a third result the color is left.
     written = 3 + sum(len(layer.channels) for layer in layers.aovs.values()) + (layers.alpha is not None) + 10

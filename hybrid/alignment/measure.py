@@ -106,8 +106,8 @@ class FrameFacts:
     transparent: float | None  # share of the pixels whose alpha is below 0.999
     noise_free: float  # share of the tiles without noise, in [0, 1]
     samples: float | None  # samples per pixel, if known
-    # correlation of the noise of neighbouring pixels along x or y, whichever is less; None if unknown
-    noise_correlation: float | None = None
+    # correlation of the noise, (2, 4): along x and along y, at 1 to 4 pixels; None if unknown
+    noise_correlation: tuple[tuple[float, ...], ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -206,7 +206,7 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
     alike = smalls[0], smalls[1].relit(inverse(fade))
     differ = changed if fade == NO_FADE else _changed(alike[0].textured(), alike[1].textured(), None)
     lit, same = (there, SAME) if fade == NO_FADE else (scaled(there, inverse(fade)), NEAR)
-    equal = repeats(here.irradiance, lit.irradiance, same)
+    equal = repeats(here.sampled, lit.sampled, same)
     free = equal and _is_noise_free(here)
     cut = differ > CUT and _is_cut(here, there, alike, vectors)
     unexplained = changed if reduced is None else _changed(*smalls, reduced)
@@ -267,7 +267,7 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool, same:
     without their 5×5 mean, and clipped at three times their median size: fireflies must not decide.
     """
     block = _middle(here.irradiance.shape[:2])
-    a, b = (channel_mean(frame.irradiance[block]) for frame in (here, there))
+    a, b = (channel_mean(frame.sampled[block]) for frame in (here, there))
     level = 0.5 * (cv2.blur(a, (9, 9)) + cv2.blur(b, (9, 9)))
     floor = 0.01 * measure_exposure(level[..., None])
     noise = [_high_pass(image / (level + floor)) for image in (a, b)]
@@ -291,8 +291,8 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool, same:
         chance = max(_equal_share(a, np.roll(b, APART, axis=1), compared, same), 0)
         figures.append((_equal_share(a, b, compared, same) - chance) / max(1 - chance, LEAST_UNEQUAL))
     if moved.sum() > CROP and forth is not None and back is not None:
-        d_a = a - channel_mean(_warp_block(there.irradiance, forth[0], block))
-        d_b = b - channel_mean(_warp_block(here.irradiance, back[0], block))
+        d_a = a - channel_mean(_warp_block(there.sampled, forth[0], block))
+        d_b = b - channel_mean(_warp_block(here.sampled, back[0], block))
         d = [_high_pass(image / (level + floor))[moved] for image in (d_a, d_b)]
         shares.append(int(moved.sum()))
         figures.append(2 * correlation(*d))
@@ -519,7 +519,8 @@ def scaled(frame: PreparedFrame, fade: Fade | Array) -> PreparedFrame:
     """Return a frame with `fade` times its light, but for its AOVs."""
     factor = np.array(fade, np.float32)
     variance = None if frame.variance is None else np.asarray(frame.variance * factor * factor)
-    return replace(frame, irradiance=np.asarray(frame.irradiance * factor), variance=variance)
+    gray = None if frame.as_rendered_gray is None else frame.as_rendered_gray * factor.mean()
+    return replace(frame, irradiance=np.asarray(frame.irradiance * factor), variance=variance, as_rendered_gray=gray)
 
 
 def relit(frame: PreparedFrame, fade: Fade, centre: PreparedFrame) -> PreparedFrame:

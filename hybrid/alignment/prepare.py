@@ -14,7 +14,7 @@ from hybrid.files.frame import Array, Frame
 from hybrid.files.layers import Layers
 from hybrid.files.passes import NO_PASSES, Passes
 from loops.parallel import Doubles, Mask, Places
-from nlm.average import reject_outliers, replace_nonfinite
+from nlm.average import channel_mean, reject_outliers, replace_nonfinite
 from nlm.fireflies import Highlights, add_highlights
 from nlm.guided import guided_filter, measure_guide
 from nlm.pixel_filter import PixelFilter
@@ -64,6 +64,8 @@ class PreparedFrame:
     highlights: Highlights | None = None
     # the pixel filter that is undone in the light and the guides, and applied to the finished picture
     spread: PixelFilter | None = None
+    # (H, W, 1): with it, mean over channels of the irradiance as rendered, in which equal samples are equal
+    as_rendered_gray: Array | None = None
 
     @cached_property
     def light(self) -> Array:
@@ -86,6 +88,10 @@ class PreparedFrame:
         moments = [measure_guide(layer) for layer in (self.albedo, self.normal, gray) if layer is not None]
         return Brightness(exposure, np.concatenate(moments, axis=1))
 
+    def with_filter(self, light: Array) -> Array:
+        """Apply the pixel filter that is undone in this frame, if any, to denoised light (H, W, C)."""
+        return light if self.spread is None else np.maximum(self.spread.apply(light), 0)
+
     @property
     def guide(self) -> Array | None:
         """Channels of albedo and normal (H, W, G), or None."""
@@ -97,6 +103,11 @@ class PreparedFrame:
         if self.albedo is None or not self.demodulated:
             return None
         return np.maximum(self.albedo[rows, columns], 0) + np.float32(ALBEDO_FLOOR)
+
+    @property
+    def sampled(self) -> Array:
+        """Irradiance (H, W, C) in which samples are compared: those of frames with other filters undone differ."""
+        return self.irradiance if self.as_rendered_gray is None else self.as_rendered_gray
 
     @property
     def radiance(self) -> Array:
@@ -205,6 +216,7 @@ def without_filter(frame: PreparedFrame, spread: PixelFilter) -> PreparedFrame:
         normal=normal,
         variance=None if frame.variance is None else frame.variance * np.float32(spread.gain),
         spread=spread,
+        as_rendered_gray=channel_mean(frame.irradiance)[..., None],
         aovs={
             name: undo(layer, frame.demodulated and name in frame.passes.textured) for name, layer in frame.aovs.items()
         },
