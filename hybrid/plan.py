@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybrid.alignment.measure import FIXED_NOISE_ABOVE, FrameFacts, PairFacts, least_outline_noise
+from hybrid.alignment.measure import FIXED_NOISE_ABOVE, Correlation, FrameFacts, PairFacts, least_outline_noise
 from hybrid.files.sequences import format_frames
 
 #: Stages by name, in order. A figure calls for some; others (`_switch`) run wherever their input is there.
@@ -41,10 +41,9 @@ NEURAL_STAGES = frozenset({"clean-guides", "stabilize", "alpha", "skip"})  # sta
 # Correlation of the noise of neighbouring pixels, along x or y, whichever is less: as changes of a clean picture add to
 # it, up to 0.1 is measured for independent noise, on forty shots; the narrowest tent leaves 0.17.
 WHITEN_ABOVE = 0.13
-# The same of pixels three or four apart, whichever is most: 0.02 by the filters of renderers, 0.06 by wider ones that can
-# be undone in part; errors of denoised pictures have 0.12 and more.
+# The greatest of pixels three or four apart: 0.02 by the filters of renderers, 0.06 by wider ones that can be undone in
+# part; errors of denoised pictures have 0.12 and more.
 WHITEN_BELOW = 0.1
-Correlation = Sequence[Sequence[float]]
 STILL = 0.05  # motion below a twentieth of a pixel blurs a bilinear sample by less than 1 % of its contrast
 # Share of pixels, in areas of 9×9, whose brightness the vectors do not explain. Refinement is worth its time for
 # reflections and shadows of some size; the gate is cheap and already pays for a small highlight.
@@ -133,7 +132,7 @@ class Rules:
         return " ".join([*(f"+{name}" for name in sorted(self.on)), *(f"-{name}" for name in sorted(self.off))])
 
     def whitens(self, correlation: Correlation | None) -> bool:
-        """Whether the pixel filter of a frame is undone whose noise has this correlation (2, 4)."""
+        """Whether the pixel filter of a frame is undone whose noise has this correlation."""
         return correlation is not None and self._applied(_decide_whiten([correlation]), (), NOISY).on
 
     def decide(self, frames: Sequence[FrameFacts], pairs: Sequence[PairFacts], context: Context = NOISY) -> Plan:
@@ -249,7 +248,7 @@ def _decide_whiten(correlations: Sequence[Correlation | None]) -> Decision:
     decision = _decide("whiten", near, WHITEN_ABOVE, "the noise of neighbouring pixels correlates by {:.2f}")
     if not decision.on or far < WHITEN_BELOW:
         return decision
-    why = f"and that of pixels three apart by {far:.2f}: no pixel filter that can be undone; a narrower one keeps detail"
+    why = f"that of pixels three apart by {far:.2f}: no pixel filter that can be undone; render with a narrower one"
     return replace(decision, on=False, reason=f"{decision.reason}, {why}")
 
 

@@ -18,6 +18,7 @@ from hybrid.alignment.flows import Flow, Link, PairFlows, compose_flows, measure
 from hybrid.alignment.guides import GuideFilter
 from hybrid.alignment.measure import (
     NO_FADE,
+    Correlation,
     Fade,
     FrameFacts,
     PairFacts,
@@ -42,8 +43,6 @@ from hybrid.files.shots import Shot
 from hybrid.plan import DENOISED, NOISY, RADIUS, Context, Plan, Rules, merge
 from hybrid.runtime.kept import Keeper
 from hybrid.runtime.timing import Timings
-from loops.parallel import Doubles
-from nlm.pixel_filter import find_filter
 
 Value = TypeVar("Value")
 
@@ -135,7 +134,7 @@ class FrameStream:
             self._read(number)
         frame = cast(Frame, self._cache["read", (number,)])
         if prepared.spread is not None:
-            estimate = frame.estimate if frame.estimate is None else prepared.spread.undo(frame.estimate)
+            estimate = None if frame.estimate is None else prepared.spread.undo(frame.estimate)
             frame = replace(frame, albedo=prepared.albedo, normal=prepared.normal, estimate=estimate)
         elif prepared is self.rendered(number):
             return frame
@@ -150,9 +149,9 @@ class FrameStream:
         def make(number: int) -> Array | None:
             self.keeper.trim()
             picture, spread = source.make(self, number), self._there(number).spread
-            # All others are made of frames without the filter.
-            finished = source.files is not None and picture is not None and spread is not None
-            return np.maximum(spread.undo(picture), 0) if finished else picture
+            if picture is None or spread is None or source.files is None:
+                return picture
+            return np.maximum(spread.undo(picture), 0)  # all others are made of frames without the filter
 
         denoised = self._cached("first pass", (number,), make)
         self._cache.pop(("read", (number,)), None)
@@ -294,21 +293,21 @@ class FrameStream:
         if correlation is None or not self.rules.whitens(correlation):
             return frame
         with self.timings.stage("whiten"):
-            return without_filter(frame, find_filter(np.array(correlation)))
+            return without_filter(frame, correlation)
 
     def _raw(self, number: int) -> PreparedFrame:
         return self._cached("raw", (number,), self._read)
 
-    def _correlation(self, number: int) -> tuple[tuple[float, ...], ...] | None:
+    def _correlation(self, number: int) -> Correlation | None:
         """The correlation of a frame's noise, the mean over its pairs with the frames beside it; None if unknown."""
         if "whiten" not in self.rules.allowed:
             return None
         pairs = [pair for pair in pairwise(self.around(number, 1)) if all(map(self.shot.has, pair))]
         found = [self._cached("correlation", pair, self._measure_correlation) for pair in pairs]
         known = [correlation for correlation in found if correlation is not None]
-        return tuple(map(tuple, np.mean(known, axis=0).tolist())) if known else None
+        return cast(Correlation, tuple(map(tuple, np.mean(known, axis=0).tolist()))) if known else None
 
-    def _measure_correlation(self, a: int, b: int) -> Doubles | None:
+    def _measure_correlation(self, a: int, b: int) -> Correlation | None:
         first, second = self._raw(a), self._raw(b)
         with self.timings.stage("plan"):
             return noise_correlation(first, second)

@@ -88,6 +88,8 @@ KNOWN = 6.0
 FIREFLY, EXPLAINED = 6.0, 2.0
 
 
+#: Correlation of the noise along x and along y, each at 1 to 4 pixels.
+Correlation = tuple[tuple[float, ...], tuple[float, ...]]
 Fade = tuple[float, float, float]
 NO_FADE: Fade = (1.0, 1.0, 1.0)
 
@@ -106,8 +108,7 @@ class FrameFacts:
     transparent: float | None  # share of the pixels whose alpha is below 0.999
     noise_free: float  # share of the tiles without noise, in [0, 1]
     samples: float | None  # samples per pixel, if known
-    # correlation of the noise, (2, 4): along x and along y, at 1 to 4 pixels; None if unknown
-    noise_correlation: tuple[tuple[float, ...], ...] | None = None
+    noise_correlation: Correlation | None = None  # of the noise; None if unknown
 
 
 @dataclass(frozen=True)
@@ -299,26 +300,27 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool, same:
     return float(np.clip(np.average(figures, weights=shares), -1, 1)) if figures else 0.0
 
 
-def noise_correlation(here: PreparedFrame, there: PreparedFrame) -> Doubles | None:
+def noise_correlation(here: PreparedFrame, there: PreparedFrame) -> Correlation | None:
     """Correlation of the noise of two neighbours (`nlm.pixel_filter.measure_correlation`); None where it is unknown.
 
     Frames are compared along whole pixels of the vectors, in the middle of the picture, where their guides agree.
     """
     block = _middle(here.irradiance.shape[:2])
-    rows, columns = (places[block] for places in np.indices(here.valid.shape))
+    height, width = here.valid.shape
+    rows, columns = np.arange(height)[block[0], None], np.arange(width)[None, block[1]]
     vectors = rendered_flow(here, there)
     trusted = here.valid[block].copy()
     if vectors is not None:
         moved = np.rint(np.where(vectors[1][block][..., None], vectors[0][block], np.float32(-1e6))).astype(np.intp)
         columns, rows = columns + moved[..., 0], rows + moved[..., 1]
-        height, width = here.valid.shape
         trusted &= (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
         rows, columns = rows.clip(0, height - 1), columns.clip(0, width - 1)
     trusted &= there.valid[rows, columns]
     for guide, other in _guides(here, there):
         trusted &= np.abs(guide[block] - other[rows, columns]).max(axis=-1) < SAME_SURFACE
     first, second = channel_mean(here.irradiance[block]), channel_mean(there.irradiance[rows, columns])
-    return measure_correlation(first - second, trusted, GRAIN * np.maximum(np.abs(first), np.abs(second)))
+    found = measure_correlation(first - second, trusted, np.float32(GRAIN) * np.maximum(np.abs(first), np.abs(second)))
+    return None if found is None else (tuple(found[0].tolist()), tuple(found[1].tolist()))
 
 
 def _equal_share(a: Array, b: Array, compared: Mask, same: float) -> float:

@@ -1,5 +1,6 @@
 """Prepared frames: finite, divided by their albedo, with the renderer's vectors in our convention."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar, cast
@@ -17,7 +18,7 @@ from loops.parallel import Doubles, Mask, Places
 from nlm.average import channel_mean, reject_outliers, replace_nonfinite
 from nlm.fireflies import Highlights, add_highlights
 from nlm.guided import guided_filter, measure_guide
-from nlm.pixel_filter import PixelFilter
+from nlm.pixel_filter import PixelFilter, find_filter
 
 Values = TypeVar("Values", bound=NDArray[Any])
 
@@ -196,11 +197,12 @@ def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
     )
 
 
-def without_filter(frame: PreparedFrame, spread: PixelFilter) -> PreparedFrame:
-    """Undo a pixel filter in the light and the guides of a frame, as rendered.
+def without_filter(frame: PreparedFrame, correlation: Sequence[Sequence[float]]) -> PreparedFrame:
+    """Undo the pixel filter by which noise has this correlation in the light and the guides of a frame, as rendered.
 
     The quotient of color and albedo is that of both without the filter. Light may be negative beside what is bright.
     """
+    spread = find_filter(np.array(correlation))
     albedo, normal = (None if layer is None else spread.undo(layer) for layer in (frame.albedo, frame.normal))
     albedo = None if albedo is None else np.maximum(albedo, 0)
 
