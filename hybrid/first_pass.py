@@ -261,8 +261,9 @@ class _KeptPictures:
             "forced": forced,
             **versions("pyoidn"),
         }
-        # Frames on each side by which fireflies are found, and those that show whether guides hold noise.
-        self._support = REACH + (GUIDE_RADIUS if mode == "oidn-clean" else 0)
+        # Frames on each side by which fireflies are found, those that show whether guides hold noise, and one whose
+        # noise is compared with that of the last.
+        self._support = REACH + (GUIDE_RADIUS if mode == "oidn-clean" else 0) + 1
 
     def read_or_run(self, frame: Frame, *noisy_guides: bool, run: Callable[..., Array]) -> Array:
         """Read a kept picture that would be the same now, else make and keep it; ValueError for another file there."""

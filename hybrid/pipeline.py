@@ -252,8 +252,12 @@ def _others(number: int, numbers: Iterable[int]) -> str:
 
 
 def temporal_support(first_pass: FirstPass | None, radius: int, rules: Rules) -> int:
-    """Count the frames on each side that a frame depends on: of windows, two for fireflies, one to average results."""
-    return REACH + ("stabilize" in rules.allowed) + (radius if first_pass is None else first_pass.reach(radius))
+    """Count the frames on each side that a frame depends on.
+
+    Those of its window, two for fireflies, one to average results, and one whose noise is compared.
+    """
+    more = ("stabilize" in rules.allowed) + ("whiten" in rules.allowed)
+    return REACH + more + (radius if first_pass is None else first_pass.reach(radius))
 
 
 def sources_of(views: Sequence[View], radius: int, rules: Rules, earlier: SourcesOf | None = None) -> SourcesOf:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from flow.warp import warp
 from hybrid.alignment.align import align, align_results, measure_stillness
-from hybrid.alignment.prepare import PreparedFrame
+from hybrid.alignment.prepare import ALPHA, PreparedFrame
 from hybrid.alignment.transfer import measure_typical_exposure
 from hybrid.alignment.unfiltered import as_gray
 from hybrid.alignment.window import AlignedWindow, Trust, Window
@@ -163,6 +163,8 @@ class FrameDenoiser:
             denoised = self._correct(denoised, frame, result, moving)
             if frame.highlights is not None:
                 denoised = _with_highlights(denoised, frame.highlights)
+            if frame.spread is not None:
+                denoised = _with_filter(denoised, frame)
             denoised, beyond = _with_unfiltered(denoised, frame), frame.unfiltered.count
         return FrameResult(
             denoised,
@@ -429,6 +431,13 @@ def _with_highlights(denoised: Denoised, highlights: Highlights) -> Denoised:
         for layers in (denoised.aovs, denoised.extra)
     )
     return replace(denoised, color=color, aovs=aovs, extra=extra)
+
+
+def _with_filter(denoised: Denoised, frame: PreparedFrame) -> Denoised:
+    """The picture, its parts and all other light as the renderer's pixel filter makes it."""
+    aovs = {name: layer if name == ALPHA else frame.with_filter(layer) for name, layer in denoised.aovs.items()}
+    extra = {n: frame.with_filter(layer) if n in denoised.parts else layer for n, layer in denoised.extra.items()}
+    return replace(denoised, color=frame.with_filter(denoised.color), aovs=aovs, extra=extra)
 
 
 def _with_unfiltered(denoised: Denoised, frame: PreparedFrame) -> Denoised:

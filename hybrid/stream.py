@@ -18,6 +18,7 @@ from hybrid.alignment.flows import Flow, Link, PairFlows, compose_flows, measure
 from hybrid.alignment.guides import GuideFilter
 from hybrid.alignment.measure import (
     NO_FADE,
+    Correlation,
     Fade,
     FrameFacts,
     PairFacts,
@@ -27,11 +28,12 @@ from hybrid.alignment.measure import (
     least_outline_noise,
     measure_frame,
     measure_pair,
+    noise_correlation,
     relit,
     scaled,
     shrink,
 )
-from hybrid.alignment.prepare import PreparedFrame, prepare, prepared_planes
+from hybrid.alignment.prepare import PreparedFrame, prepare, prepared_planes, without_filter
 from hybrid.alignment.residual import Limited, measure_limited
 from hybrid.alignment.unfiltered import find_region, mirror_region
 from hybrid.alignment.window import AlignedWindow, Window
@@ -99,12 +101,15 @@ class FrameStream:
         kept = {*numbers}
         loaded = [frames[0] for kind, frames in self._cache if kind == "frame" and frames[0] in kept]
         first = max(loaded, default=min(kept)) - (REACH - 1) * self.shot.step
-        last = max(kept) + REACH * self.shot.step
-        self._cache = {
-            (kind, frames): value
-            for (kind, frames), value in self._cache.items()
-            if (first <= frames[0] <= last if kind in ("read", "rendered", "same noise") else kept.issuperset(frames))
-        }
+        last = max(kept) + (REACH + 1) * self.shot.step
+
+        def is_kept(kind: str, frames: tuple[int, ...]) -> bool:
+            if kind == "raw":  # the noise of a frame is compared with that of the next one, and then no more
+                return max(loaded, default=first) <= frames[0] <= last
+            beyond = kind in ("read", "rendered", "correlation", "same noise")
+            return first <= frames[0] <= last if beyond else kept.issuperset(frames)
+
+        self._cache = {key: value for key, value in self._cache.items() if is_kept(*key)}
 
     def around(self, number: int, radius: int | None = None) -> list[int]:
         """Numbers of the window around a frame, ascending, whether or not these frames are there."""
@@ -128,7 +133,12 @@ class FrameStream:
         if ("read", (number,)) not in self._cache:
             self._read(number)
         frame = cast(Frame, self._cache["read", (number,)])
-        return frame if prepared is self.rendered(number) else replace(frame, color=prepared.radiance)
+        if prepared.spread is not None:
+            estimate = None if frame.estimate is None else prepared.spread.undo(frame.estimate)
+            frame = replace(frame, albedo=prepared.albedo, normal=prepared.normal, estimate=estimate)
+        elif prepared is self.rendered(number):
+            return frame
+        return replace(frame, color=prepared.radiance)
 
     def denoised(self, number: int) -> Array | None:
         """The first pass of a frame, radiance (H, W, 3); None where there is none."""
@@ -138,7 +148,10 @@ class FrameStream:
 
         def make(number: int) -> Array | None:
             self.keeper.trim()
-            return source.make(self, number)
+            picture, spread = source.make(self, number), self._there(number).spread
+            if picture is None or spread is None or source.files is None:
+                return picture
+            return np.maximum(spread.undo(picture), 0)  # all others are made of frames without the filter
 
         denoised = self._cached("first pass", (number,), make)
         self._cache.pop(("read", (number,)), None)
@@ -290,7 +303,32 @@ class FrameStream:
 
     def rendered(self, number: int) -> PreparedFrame | None:
         """A frame with its fireflies; None where the shot has none."""
-        return self._cached("rendered", (number,), self._read) if self.shot.has(number) else None
+        return self._cached("rendered", (number,), self._without_filter) if self.shot.has(number) else None
+
+    def _without_filter(self, number: int) -> PreparedFrame:
+        """A frame, in which the pixel filter of its noise is undone if the stage runs."""
+        frame, correlation = self._raw(number), self._correlation(number)
+        if correlation is None or not self.rules.whitens(correlation):
+            return frame
+        with self.timings.stage("whiten"):
+            return without_filter(frame, correlation)
+
+    def _raw(self, number: int) -> PreparedFrame:
+        return self._cached("raw", (number,), self._read)
+
+    def _correlation(self, number: int) -> Correlation | None:
+        """The correlation of a frame's noise, the mean over its pairs with the frames beside it; None if unknown."""
+        if "whiten" not in self.rules.allowed:
+            return None
+        pairs = [pair for pair in pairwise(self.around(number, 1)) if all(map(self.shot.has, pair))]
+        found = [self._cached("correlation", pair, self._measure_correlation) for pair in pairs]
+        known = [correlation for correlation in found if correlation is not None]
+        return cast(Correlation, tuple(map(tuple, np.mean(known, axis=0).tolist()))) if known else None
+
+    def _measure_correlation(self, a: int, b: int) -> Correlation | None:
+        first, second = self._raw(a), self._raw(b)
+        with self.timings.stage("plan"):
+            return noise_correlation(first, second)
 
     def same_noise(self, a: int, b: int) -> float:
         """The share of the noise of two neighbouring frames, ascending, that is the same at equal pixels."""
@@ -323,8 +361,9 @@ class FrameStream:
         frame = self._there(number)
 
         def measure(n: int) -> FrameFacts:
+            correlation = self._correlation(n)
             with self.timings.stage("plan"):
-                return measure_frame(frame, self._small(n))
+                return replace(measure_frame(frame, self._small(n)), noise_correlation=correlation)
 
         return self._cached("frame facts", (number,), measure)
 
@@ -407,8 +446,9 @@ def kept_planes(
     guides = 1.5 * ((layers.albedo is not None) + (layers.normal is not None))  # in half precision
     filtered = guides if filters_guides and "clean-guides" in stages else 0.0
     support = radius if first_pass is None else first_pass.reach(radius)
-    # Fireflies are looked for in frames beyond the window.
-    frames = min(2 * support + 1 + (REACH if "fireflies" in stages else 0), len(shot.files))
+    # Fireflies are looked for in frames beyond the window, whose noise is compared with that of the next one.
+    beyond = (REACH if "fireflies" in stages else 0) + ("whiten" in stages)
+    frames = min(2 * support + 1 + beyond, len(shot.files))
     results = 2 if "stabilize" in stages else 1
     # With the neighbours' samples, trust, drift and excess; of a third result the color is left.
     written = 3 + sum(len(layer.channels) for layer in layers.aovs.values()) + (layers.alpha is not None) + 10

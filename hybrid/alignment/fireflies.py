@@ -105,7 +105,7 @@ def _find_highlights(
     still = np.zeros_like(centre.points)
     moved = {-1: still, 1: still}
     last: dict[int, PreparedFrame | None] = {-1: frame, 1: frame}
-    compared, equal = [(frame.irradiance, still)], SAME
+    compared, equal = [(frame.sampled, still)], SAME
     for distance, side in product(range(1, REACH + 1), (-1, 1)):
         here, undecided = last[side], witnesses.undecided
         if here is None or not (distance == 1 or undecided.any()):
@@ -119,14 +119,14 @@ def _find_highlights(
             if (fade != 1).any():
                 there, equal = scaled(there, fade), NEAR
             lights = _lights_of(there, follow_motion(centre, motion), centre, fade)
-            fresh = _has_own_noise(frame, places, there.irradiance, lights, motion, compared, equal)
+            fresh = _has_own_noise(frame, places, there.sampled, lights, motion, compared, equal)
             if distance == 1:
                 alone &= ~(fresh & recurs_nearby(places, frame.irradiance, lights.pixels, there.irradiance))
             tested = fresh & undecided
             same = tested & same_highlight(centre, motion, lights)
             same[same] = without_strangers(centre[same], frame.irradiance, lights.pixels[same], there.irradiance)
         witnesses.add(lights, motion, tested, same)
-        compared.append((there.irradiance, motion))
+        compared.append((there.sampled, motion))
     lasting = witnesses.lasting
     return average_highlights(centre, witnesses.found)[lasting], alone & ~lasting
 
@@ -151,7 +151,7 @@ def _has_own_noise(
 ) -> Mask:
     """Return which places (K,) another frame `there` shows with samples that no frame of `compared` has.
 
-    `compared` are irradiances with the motion there; samples are the same up to a share `equal` of their value.
+    `compared` are those of others with the motion there; samples are the same up to a share `equal` of their value.
     """
     inside = np.isfinite(lights.light).all(axis=1)
     repeated = np.zeros(len(places), bool)

@@ -17,6 +17,7 @@ from hybrid.files.frame import Array
 from loops.parallel import Doubles, Mask, Places
 from nlm.average import channel_mean, reject_outliers
 from nlm.gate import color_gate
+from nlm.pixel_filter import measure_correlation
 from nlm.variance import second_differences
 
 # Rows to which frames are reduced for measuring: a mean of k×k pixels has a k-th of their noise, and a k²-th of their
@@ -36,6 +37,8 @@ GRAIN = 4 * NEAR
 # Means of 9×9 pixels of guides that differ by more, in units of albedo, show other surfaces; depth of field leaves
 # noise of 0.05 in a pixel, and a tenth of it in these means.
 GUIDE_CHANGE = 0.02
+# Guides of a pixel that differ by more, in units of albedo, show other surfaces, or more noise than the light has.
+SAME_SURFACE = 0.1
 # Every so many rows are looked at for noise of a frame: all take a tenth of a second at 1920×1080.
 GRAIN_ROWS = 16
 # Pixels of such a row whose noise is compared together, and the ratio of samples from which on two frames differ in
@@ -88,6 +91,8 @@ KNOWN = 6.0
 FIREFLY, EXPLAINED = 6.0, 2.0
 
 
+#: Correlation of the noise along x and along y, each at 1 to 4 pixels.
+Correlation = tuple[tuple[float, ...], tuple[float, ...]]
 Fade = tuple[float, float, float]
 NO_FADE: Fade = (1.0, 1.0, 1.0)
 
@@ -106,6 +111,7 @@ class FrameFacts:
     transparent: float | None  # share of the pixels whose alpha is below 0.999
     noise_free: float  # share of the tiles without noise, in [0, 1]
     samples: float | None  # samples per pixel, if known
+    noise_correlation: Correlation | None = None  # of the noise; None if unknown
 
 
 @dataclass(frozen=True)
@@ -205,7 +211,7 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
     alike = smalls[0], smalls[1].relit(inverse(fade))
     differ = changed if fade == NO_FADE else _changed(alike[0].textured(), alike[1].textured(), None)
     lit, same = (there, SAME) if fade == NO_FADE else (scaled(there, inverse(fade)), NEAR)
-    equal = repeats(here.irradiance, lit.irradiance, same)
+    equal = repeats(here.sampled, lit.sampled, same)
     free = equal and _is_noise_free(here)
     cut = differ > CUT and _is_cut(here, there, alike, vectors)
     unexplained = changed if reduced is None else _changed(*smalls, reduced)
@@ -267,7 +273,7 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool, same:
     without their 5×5 mean, and clipped at three times their median size: fireflies must not decide.
     """
     block = _middle(here.irradiance.shape[:2])
-    a, b = (channel_mean(frame.irradiance[block]) for frame in (here, there))
+    a, b = (channel_mean(frame.sampled[block]) for frame in (here, there))
     level = 0.5 * (cv2.blur(a, (9, 9)) + cv2.blur(b, (9, 9)))
     floor = 0.01 * measure_exposure(level[..., None])
     noise = [_high_pass(image / (level + floor)) for image in (a, b)]
@@ -291,12 +297,35 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool, same:
         chance = max(_equal_share(a, np.roll(b, APART, axis=1), compared, same), 0)
         figures.append((_equal_share(a, b, compared, same) - chance) / max(1 - chance, LEAST_UNEQUAL))
     if moved.sum() > CROP and forth is not None and back is not None:
-        d_a = a - channel_mean(_warp_block(there.irradiance, forth[0], block))
-        d_b = b - channel_mean(_warp_block(here.irradiance, back[0], block))
+        d_a = a - channel_mean(_warp_block(there.sampled, forth[0], block))
+        d_b = b - channel_mean(_warp_block(here.sampled, back[0], block))
         d = [_high_pass(image / (level + floor))[moved] for image in (d_a, d_b)]
         shares.append(int(moved.sum()))
         figures.append(2 * correlation(*d))
     return float(np.clip(np.average(figures, weights=shares), -1, 1)) if figures else 0.0
+
+
+def noise_correlation(here: PreparedFrame, there: PreparedFrame) -> Correlation | None:
+    """Correlation of the noise of two neighbours (`nlm.pixel_filter.measure_correlation`); None where it is unknown.
+
+    Frames are compared along whole pixels of the vectors, in the middle of the picture, where their guides agree.
+    """
+    block = _middle(here.irradiance.shape[:2])
+    height, width = here.valid.shape
+    rows, columns = np.arange(height)[block[0], None], np.arange(width)[None, block[1]]
+    vectors = rendered_flow(here, there)
+    trusted = here.valid[block].copy()
+    if vectors is not None:
+        moved = np.rint(np.where(vectors[1][block][..., None], vectors[0][block], np.float32(-1e6))).astype(np.intp)
+        columns, rows = columns + moved[..., 0], rows + moved[..., 1]
+        trusted &= (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+        rows, columns = rows.clip(0, height - 1), columns.clip(0, width - 1)
+    trusted &= there.valid[rows, columns]
+    for guide, other in _guides(here, there):
+        trusted &= np.abs(guide[block] - other[rows, columns]).max(axis=-1) < SAME_SURFACE
+    first, second = channel_mean(here.irradiance[block]), channel_mean(there.irradiance[rows, columns])
+    found = measure_correlation(first - second, trusted, np.float32(GRAIN) * np.maximum(np.abs(first), np.abs(second)))
+    return None if found is None else (tuple(found[0].tolist()), tuple(found[1].tolist()))
 
 
 def _equal_share(a: Array, b: Array, compared: Mask, same: float) -> float:
@@ -497,7 +526,8 @@ def scaled(frame: PreparedFrame, fade: Fade | Array) -> PreparedFrame:
     """Return a frame with `fade` times its light, but for its AOVs."""
     factor = np.array(fade, np.float32)
     variance = None if frame.variance is None else np.asarray(frame.variance * factor * factor)
-    return replace(frame, irradiance=np.asarray(frame.irradiance * factor), variance=variance)
+    gray = None if frame.as_rendered_gray is None else frame.as_rendered_gray * factor.mean()
+    return replace(frame, irradiance=np.asarray(frame.irradiance * factor), variance=variance, as_rendered_gray=gray)
 
 
 def relit(frame: PreparedFrame, fade: Fade, centre: PreparedFrame) -> PreparedFrame:

@@ -1,6 +1,7 @@
 """Prepared frames: finite, divided by their albedo, with the renderer's vectors in our convention."""
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -14,9 +15,10 @@ from hybrid.files.frame import Array, Frame
 from hybrid.files.layers import Layers
 from hybrid.files.passes import NO_PASSES, Passes
 from loops.parallel import Doubles, Mask, Places
-from nlm.average import reject_outliers, replace_nonfinite
+from nlm.average import channel_mean, reject_outliers, replace_nonfinite
 from nlm.fireflies import Highlights, add_highlights
 from nlm.guided import guided_filter, measure_guide
+from nlm.pixel_filter import PixelFilter, find_filter
 
 Values = TypeVar("Values", bound=NDArray[Any])
 
@@ -61,6 +63,10 @@ class PreparedFrame:
     # persistent highlights: lights of a pixel that other frames show as well, averaged over these frames. They are not
     # in `irradiance`, and are added to the finished picture.
     highlights: Highlights | None = None
+    # the pixel filter that is undone in the light and the guides, and applied to the finished picture
+    spread: PixelFilter | None = None
+    # (H, W, 1): with it, mean over channels of the irradiance as rendered, in which equal samples are equal
+    as_rendered_gray: Array | None = None
 
     @cached_property
     def light(self) -> Array:
@@ -83,6 +89,10 @@ class PreparedFrame:
         moments = [measure_guide(layer) for layer in (self.albedo, self.normal, gray) if layer is not None]
         return Brightness(exposure, np.concatenate(moments, axis=1))
 
+    def with_filter(self, light: Array) -> Array:
+        """Apply the pixel filter that is undone in this frame, if any, to denoised light (H, W, C)."""
+        return light if self.spread is None else np.maximum(self.spread.apply(light), 0)
+
     @property
     def guide(self) -> Array | None:
         """Channels of albedo and normal (H, W, G), or None."""
@@ -94,6 +104,11 @@ class PreparedFrame:
         if self.albedo is None or not self.demodulated:
             return None
         return np.maximum(self.albedo[rows, columns], 0) + np.float32(ALBEDO_FLOOR)
+
+    @property
+    def sampled(self) -> Array:
+        """Irradiance (H, W, C) in which samples are compared: those of frames with other filters undone differ."""
+        return self.irradiance if self.as_rendered_gray is None else self.as_rendered_gray
 
     @property
     def radiance(self) -> Array:
@@ -179,6 +194,34 @@ def prepare(frame: Frame, *, demodulated: bool = True) -> PreparedFrame:
         pass_colors=pass_colors,
         passes=passes,
         samples=frame.samples,
+    )
+
+
+def without_filter(frame: PreparedFrame, correlation: Sequence[Sequence[float]]) -> PreparedFrame:
+    """Undo the pixel filter by which noise has this correlation in the light and the guides of a frame, as rendered.
+
+    The quotient of color and albedo is that of both without the filter. Light may be negative beside what is bright.
+    """
+    spread = find_filter(np.array(correlation))
+    albedo, normal = (None if layer is None else spread.undo(layer) for layer in (frame.albedo, frame.normal))
+    albedo = None if albedo is None else np.maximum(albedo, 0)
+
+    def undo(layer: Array, textured: bool) -> Array:
+        if not textured or frame.albedo is None or albedo is None:
+            return spread.undo(layer)
+        return demodulate(spread.undo(remodulate(layer, frame.albedo)), albedo)
+
+    return replace(
+        frame,
+        irradiance=undo(frame.irradiance, frame.demodulated),
+        albedo=albedo,
+        normal=normal,
+        variance=None if frame.variance is None else frame.variance * np.float32(spread.gain),
+        spread=spread,
+        as_rendered_gray=channel_mean(frame.irradiance)[..., None],
+        aovs={
+            name: undo(layer, frame.demodulated and name in frame.passes.textured) for name, layer in frame.aovs.items()
+        },
     )
 
 

@@ -108,7 +108,9 @@ class Classical:
     def __call__(self, shot: Frames) -> Iterator[tuple[int, Array]]:
         stream = self.window.stream(shot)
         for number in shot.numbers:
-            yield number, self.denoise(stream.align(number))
+            denoised, frame = self.denoise(stream.align(number)), stream.frame(number)
+            assert frame is not None
+            yield number, frame.with_filter(denoised)
 
     def maps(self, shot: Frames, numbers: Sequence[int]) -> Iterator[tuple[int, dict[str, Array]]]:
         stream = self.window.stream(shot)
@@ -194,7 +196,7 @@ def oidn_then_average(shot: Frames) -> Iterator[tuple[int, Array]]:
     """Run OIDN's best mode on each frame, then take the aligned robust average of the results."""
     best = partial(denoise_frame_oidn, prefilter="high")
     denoised = MappedShot(shot, lambda frame: replace(frame, color=best(frame), variance=None))
-    stream = FrameStream(denoised, Rules())
+    stream = FrameStream(denoised, Rules(off=frozenset({"whiten"})))
     for number in shot.numbers:
         yield number, aligned_robust_average(stream.align(number))
 

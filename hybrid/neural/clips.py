@@ -83,7 +83,9 @@ def write_clips(
     first_passes = [find_first_pass(estimate, shot) for shot in rendered]
     filter_guides = prefilter_guides if has_oidn_networks() else None
     streams = [
-        FrameStream(shot, Rules(), first_pass.first_pass, radius=radius, filter_guides=filter_guides)
+        FrameStream(
+            shot, Rules(off=frozenset({"whiten"})), first_pass.first_pass, radius=radius, filter_guides=filter_guides
+        )
         for shot, first_pass in zip(rendered, first_passes, strict=True)
     ]
     # OIDN, if it makes the first passes, is there to denoise the pooled samples too.

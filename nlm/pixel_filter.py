@@ -1,0 +1,137 @@
+"""The pixel filter of a renderer, as the correlation of its noise shows it: measured, undone and applied again.
+
+A renderer that adds each sample to all pixels under its filter makes neighbouring pixels share noise. Denoisers take
+such noise for detail. With the filter undone the noise is that of a filter of one pixel.
+"""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from loops.parallel import Doubles, Floats, Mask
+
+# Pixels apart at which noise is compared: that of a filter of five pixels, as renderers have at most, ends there.
+_LAGS = (1, 2, 3, 4)
+# Deviation, pixels, of the Gaussian mean without which noise is compared: light that moves differs by more than noise
+# over so many pixels. It takes a hundredth of the noise with it, for which the measure accounts.
+_MEAN = 4.0
+# Side, pixels, of the tiles whose median is the measure, and the least number of them. In many tiles of a clean frame
+# vectors do not explain the picture, which then differs as correlated noise does.
+_TILE, _LEAST_TILES = 16, 8
+# Frequencies at which a filter leaves less power, as a share of the noise, are not amplified further: below, errors of
+# the measure decide. With 0.02 filters that leave 0.007 gain 0.5 dB, and wider ones lose 2; with 0.05 the first lose 4.
+_LEAST_POWER = 0.03
+# Half the taps of a filter: the inverse of the widest has ended there.
+_REACH = 16
+
+
+class PixelFilter(NamedTuple):
+    """A separable, symmetric filter and its inverse, each of `2 * 16 + 1` taps of sum 1 along x and along y."""
+
+    spread: tuple[Floats, Floats]
+    inverse: tuple[Floats, Floats]
+
+    @property
+    def gain(self) -> float:
+        """By how much the filter, undone, raises the variance of noise that it has spread."""
+        along_x, along_y = (float(np.square(taps, dtype=np.float64).sum()) for taps in self.spread)
+        return 1 / (along_x * along_y)
+
+    def undo(self, image: Floats) -> Floats:
+        """Filter an image (H, W, C) by the inverse; pixels beside bright ones may become negative."""
+        return _filter(image, self.inverse)
+
+    def apply(self, image: Floats) -> Floats:
+        """Filter an image (H, W, C)."""
+        return _filter(image, self.spread)
+
+
+def measure_correlation(difference: Floats, trusted: Mask, least: Floats) -> Doubles | None:
+    """Measure how neighbouring pixels share the noise of a frame.
+
+    Parameters
+    ----------
+    difference : (H, W) float32, of two frames that show the same, so that it is noise
+    trusted : (H, W) bool, where they do
+    least : (H, W) float32, difference up to which there is no noise to measure
+
+    Returns
+    -------
+    (2, 4) float64 or None
+        Correlation of the noise at 1 to 4 pixels along x and along y; None with too little noise.
+
+    Notes
+    -----
+    With h the difference without its Gaussian mean G of 4 pixels, each tile of 16×16 pixels gives Σ h h' / Σ h² over
+    its trusted pixels. A picture that differs is alike along the diagonals too: half of the tiles count, those least
+    alike two pixels along these, by their median m. One bright sample decides no more than its own tile. G takes a part
+    of the noise with it: where ρ is its correlation, and S the sum of that over all pixels,
+
+        m = (ρ − S b) / (1 − S b₀),    b = 2 G − G ⋆ G,
+
+    which is solved by iteration.
+    """
+    h = np.where(trusted, difference - cv2.GaussianBlur(difference, (0, 0), _MEAN), np.float32(0))
+    known = trusted.astype(np.float32)
+    power, count, level = (_tile_sums(layer) for layer in (h * h, known, least * least))
+    counted = (2 * count > _TILE**2) & (power > level)
+    if np.count_nonzero(counted) < _LEAST_TILES:
+        return None
+    variance = power[counted] / count[counted]
+
+    def alike(down: int, right: int) -> Doubles:
+        shared, pairs = (_tile_sums(_product(layer, down, right))[counted] for layer in (h, known))
+        return shared / (np.maximum(pairs, 1) * variance)
+
+    across = alike(2, 2) + alike(2, -2)
+    noise = across <= np.median(across)
+    found = np.array(
+        [[np.median(alike(*lag)[noise]) for lag in lags] for lags in ([(0, n) for n in _LAGS], [(n, 0) for n in _LAGS])]
+    )
+    distance = np.array([0, *_LAGS])
+    taken = 2 * _gaussian(distance, _MEAN**2) - _gaussian(distance, 2 * _MEAN**2)
+    correlation, total = found, 1.0
+    for _ in range(20):  # each leaves less than a third of the error
+        correlation = found * (1 - total * taken[0]) + total * taken[1:]
+        total = float(np.prod(1 + 2 * correlation.sum(axis=1)))
+    return correlation
+
+
+def find_filter(correlation: Doubles) -> PixelFilter:
+    """Find the filter that gives white noise this correlation (2, 4) along x and along y.
+
+    Its spectrum is the square root of that of the noise, 1 + 2 Σ ρ_l cos(l ω), which counts as 0.03 at least.
+    """
+    angle = 2 * np.pi * np.fft.fftfreq(2 * _REACH + 1)
+    waves = np.cos(np.array(_LAGS)[:, None] * angle)
+    power = np.maximum(1 + 2 * correlation @ waves, _LEAST_POWER)
+    forth, back = (np.fft.fftshift(np.fft.ifft(power**exponent).real, axes=1) for exponent in (0.5, -0.5))
+    forth, back = (taps / taps.sum(axis=1, keepdims=True) for taps in (forth, back))
+    return PixelFilter(tuple(forth.astype(np.float32)), tuple(back.astype(np.float32)))
+
+
+def _filter(image: Floats, taps: tuple[Floats, Floats]) -> Floats:
+    found = cv2.sepFilter2D(np.ascontiguousarray(image, np.float32), -1, *taps, borderType=cv2.BORDER_REFLECT_101)
+    return np.asarray(found, np.float32).reshape(image.shape)
+
+
+def _product(layer: Floats, down: int, right: int) -> Floats:
+    """The product of each pixel and another one, so many rows and columns further; 0 beyond the edge."""
+    height, width = layer.shape
+    product = np.zeros_like(layer)
+    here = slice(height - down), slice(max(-right, 0), width - max(right, 0))
+    product[here] = layer[here] * layer[down:, max(right, 0) : width + min(right, 0)]
+    return product
+
+
+def _tile_sums(layer: Floats) -> Doubles:
+    """Sums over whole tiles."""
+    rows, columns = (size // _TILE for size in layer.shape)
+    tiles = layer[: rows * _TILE, : columns * _TILE].reshape(rows, _TILE, columns, _TILE)
+    return np.asarray(tiles.sum(axis=(1, 3), dtype=np.float64))
+
+
+def _gaussian(distance: Doubles, variance: float) -> Doubles:
+    """A Gaussian of two dimensions at a distance, pixels."""
+    return np.exp(-np.square(distance) / (2 * variance)) / (2 * np.pi * variance)
