@@ -19,6 +19,7 @@ from hybrid.runtime.timing import Timings
 from nlm.average import average, reject_outliers
 from nlm.drift import drift_weights, pull_to_centre
 from nlm.gate import SHARE, agreement_weight, color_gate, color_gates
+from nlm.interpolation import interpolation_weight, measure_noise
 from nlm.pooling import SampleRange
 from nlm.relight import relight
 from nlm.samples import SampleMean, average_neighbours
@@ -114,7 +115,7 @@ def align(
     if window.first_pass is None:
         pictures = warped.layers.pop("color")
     else:
-        pictures = _warp_first_pass(window, window.first_pass, coverage, padded, timings)
+        pictures, exact = _warp_first_pass(window, window.first_pass, coverage, padded, timings)
     with timings.stage("confidence"):
         centre_irradiance = _fill_centre(warped, pictures, centre_irradiance, sources)
         bright = window.lit.as_light if "light" in warped.layers else window.lit.as_rendered
@@ -136,6 +137,10 @@ def align(
                 pictures, centre_irradiance, warped.confidence, coverage, bright.exposure, stages
             )
             del coverage  # windows are large
+            for confidence in confidences:
+                for trust, weight in zip(confidence, exact, strict=True):
+                    if weight is not None:
+                        trust *= weight
             trusted = _trust_denoised(window, pictures, centre_irradiance, confidences, bright.exposure, padded.start)
         else:
             trusted = _trust_noisy(warped, centre_irradiance, bright.exposure, stages)
@@ -204,7 +209,7 @@ def align_results(
             here = Trust(known.coverage[padded], known.confidence[padded])
             _set_trust(confidence, coverage, window, index, here, padded)
     assert window.first_pass is not None
-    results = _warp_first_pass(window, window.first_pass, coverage, padded, timings)
+    results, _ = _warp_first_pass(window, window.first_pass, coverage, padded, timings)
     with timings.stage("stabilize"):
         divisor = None if centre.albedo is None or not centre.demodulated else centre.albedo[padded]
         light = results if divisor is None else demodulate(results, divisor)
@@ -312,12 +317,17 @@ def _set_trust(confidence: Array, coverage: Array, window: Window, index: int, t
 
 def _warp_first_pass(
     window: Window, first_pass: Sequence[Array | None], coverage: Array, rows: slice, timings: Timings
-) -> Array:
-    """Warp first passes to these rows, (T, h, W, 3); the centre's, with coverage 0, where a neighbour has none."""
+) -> tuple[Array, list[Array | None]]:
+    """Warp first passes to these rows, (T, h, W, 3); the centre's, with coverage 0, where a neighbour has none.
+
+    With the weight of each by its interpolation, (h, W); None: 1.
+    """
     middle = first_pass[len(first_pass) // 2]
     if middle is None:
         raise ValueError(f"frame {window.centre.number} has no first pass, expected one like its neighbours")
     warped = np.empty((len(first_pass), *middle[rows].shape), np.float32)
+    weights: list[Array | None] = [None] * len(first_pass)
+    noise = measure_noise(window.centre.radiance[rows], middle[rows])
     for index, (there, link) in enumerate(zip(first_pass, window.links, strict=True)):
         if link is None or there is None:
             warped[index] = middle[rows]
@@ -330,11 +340,13 @@ def _warp_first_pass(
             flow = link.forward.vectors
             if flow.any():
                 warp(there, flow[rows], interpolation="bicubic", first_row=rows.start, out=warped[index])
+                bilinear, _ = warp(there, flow[rows], first_row=rows.start)
+                weights[index] = interpolation_weight(warped[index], bilinear, middle[rows], noise)
             else:
                 warped[index] = there[rows]
             fill_uncovered(warped[index], middle[rows], coverage[index])
         window.release()
-    return warped
+    return warped, weights
 
 
 def _trust_noisy(warped: _Warped, centre_irradiance: Array, exposure: float, stages: Collection[str]) -> _Trusted:
