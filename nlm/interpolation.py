@@ -27,7 +27,7 @@ def measure_noise(noisy: Floats, estimate: Floats) -> Floats:
         The 15×15 mean of (noisy − estimate)², in the mean over channels.
     """
     # The running sums of a box filter round to a little below 0.
-    return np.maximum(cv2.blur(_mean_square(noisy - estimate), _NOISE_SIZE), 0)
+    return np.asarray(np.maximum(cv2.blur(_mean_square(noisy - estimate), _NOISE_SIZE), 0), np.float32)
 
 
 def interpolation_weight(warped: Floats, bilinear: Floats, centre: Floats, variance: Floats) -> Floats:
@@ -56,7 +56,7 @@ def interpolation_weight(warped: Floats, bilinear: Floats, centre: Floats, varia
     error += np.maximum(_mean_square(warped - centre) - _DEVIATIONS * variance, 0)
     # Least float32: without noise, and where nothing differs, the weight is 1.
     least = np.finfo(np.float32).tiny
-    return (variance + least) / (variance + error + least)
+    return np.asarray((variance + least) / (variance + error + least), np.float32)
 
 
 def _mean_square(x: Floats) -> Floats:

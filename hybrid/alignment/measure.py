@@ -655,12 +655,12 @@ def _samples_ratio(here: PreparedFrame, there: PreparedFrame) -> float:
         return there.samples / here.samples
     noises = []
     for frame in (here, there):
-        sums = [
+        change, level = (
             np.add.reduceat(part.mean(axis=-1), np.arange(0, part.shape[1], GRAIN_COLUMNS), axis=1)
             for part in map(np.abs, _second_differences(frame.irradiance))
-        ]
-        noises.append(np.divide(*sums, out=np.zeros_like(sums[0]), where=sums[1] > 0))
-    grainy = np.minimum(*noises) > GRAIN
+        )
+        noises.append(np.divide(change, level, out=np.zeros_like(change), where=level > 0))
+    grainy = np.minimum(noises[0], noises[1]) > GRAIN
     if np.count_nonzero(grainy) < FEW:
         return 1.0
     ratio = float(np.median(noises[0][grainy] / noises[1][grainy])) ** 2

@@ -25,7 +25,7 @@ from tests.exr_files import write_layers
 from tests.scenes import Scene
 
 SIZE = (40, 56)
-COMMANDS = [["denoise", "--preset", "draft"], ["denoise", "--preset", "fast"]]
+COMMANDS = [["denoise", "--preset", "draft"], ["denoise", "--preset", "balanced"]]
 BLOCK = slice(12, 28), slice(16, 36)
 
 
