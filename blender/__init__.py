@@ -19,6 +19,7 @@ CLASSES = (
 HANDLERS = (
     ("load_pre", jobs.stop_current),
     ("load_post", jobs.restore_all),
+    ("save_pre", jobs.make_relative),
     ("render_init", jobs.protect),
     ("render_complete", jobs.completed),
     ("render_cancel", jobs.cancelled),

@@ -8,7 +8,7 @@ from typing import Any
 
 import bpy
 
-from . import command, frames, install, scenes, settings
+from . import command, compositor, frames, install, scenes, settings
 
 INTERVAL = 0.25  # seconds between two updates
 LOG = "ravg.log"  # the text block that holds ravg's output
@@ -17,10 +17,11 @@ WIDTH = 160  # letters of an error: Blender shows one line, cut off at its windo
 
 
 class Job:
-    """A scene being denoised; `run` is None while Blender renders its frames."""
+    """A scene being denoised; `run` is None while Blender renders its frames. `keep`: finished frames stay."""
 
-    def __init__(self, scene: bpy.types.Scene) -> None:
+    def __init__(self, scene: bpy.types.Scene, *, keep: bool = False) -> None:
         self._scene = scene.session_uid  # a name may change
+        self._keep = keep
         if reason := ravg_problem(wait=True):
             raise FileNotFoundError(reason)
         if reason := scenes.misplaced(scene):
@@ -47,12 +48,12 @@ class Job:
             raise FileNotFoundError("the scene was removed")
         there = list(scenes.rendered_files(scene))
         pattern = scenes.noisy_pattern(scene)
-        if not there:
-            raise FileNotFoundError(f"no frames {pattern}: Render and Denoise renders them")
         if scene.ravg.light_passes and scene.ravg.preset == "average":
             raise ValueError(scenes.NO_LIGHT_PASSES)
         if reason := scenes.refused(scene):
             raise ValueError(f"{reason} ({Path(pattern).parent})")
+        if not there:
+            raise FileNotFoundError(f"no frames {pattern}: Render and Denoise renders them")
         chosen, folder = scene.ravg, scenes.output_folder(scene)
         average = ["--method=classical", "--first-pass=auto"]
         how = average if chosen.preset == "average" else [f"--preset={chosen.preset}"]
@@ -60,7 +61,7 @@ class Job:
         arguments += [f"--output={folder}", f"--frames={frames.ranges(there)}"]
         if chosen.light_passes:
             arguments.append("--aov=all")
-        if chosen.resume:
+        if self._keep:
             arguments.append("--resume")
         outputs = scenes.denoised_files(scene)
         self._folder = folder
@@ -246,10 +247,10 @@ def wait() -> None:
         current.advance()
 
 
-def begin(scene: bpy.types.Scene) -> Job:
+def begin(scene: bpy.types.Scene, *, keep: bool = False) -> Job:
     """Make the current job; FileNotFoundError if the command is missing, or the frames have no folder."""
     global current
-    current = Job(scene)
+    current = Job(scene, keep=keep)
     return current
 
 
@@ -276,17 +277,29 @@ def stop_current(*_: Any) -> None:
 
 @bpy.app.handlers.persistent
 def restore_all(*_: Any) -> None:
-    """Restore the settings of all scenes of a file that was saved during a render."""
+    """Restore all scenes of a file: settings as they were before a render, frames that have moved with the file."""
     for scene in bpy.data.scenes:
         scenes.restore(scene)
+        try:
+            compositor.repoint_lost(scene)
+        except (OSError, RuntimeError) as error:  # RuntimeError: Blender's, of an unreadable file
+            print(f"ravg: {error}")
+
+
+@bpy.app.handlers.persistent
+def make_relative(file: str, *_: Any) -> None:
+    """Let a file be moved with its frames."""
+    scenes.make_relative(file)
 
 
 @bpy.app.handlers.persistent
 def protect(scene: bpy.types.Scene, *_: Any) -> None:
     """Keep ravg's frames when a render that is not its own would overwrite them."""
     if not scene.ravg.lent:
-        for message in scenes.keep_existing(scene):
-            print(f"ravg: {message}")
+        problems = [problem.text for problem in compositor.problems(scene)]
+        for message in (*scenes.keep_existing(scene), *problems, compositor.movie(scene)):
+            if message:
+                print(f"ravg: {message}")
 
 
 # Handlers run in another thread while Blender still reads the scene. They leave to the timer what belongs to a job, and

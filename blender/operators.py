@@ -18,15 +18,13 @@ class SetUp(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         changed = scenes.set_up(context.scene)
         self.report({"INFO"}, f"Set up: {', '.join(changed)}" if changed else "All is set up already")
-        if changed and context.scene.render.use_persistent_data:
-            self.report({"WARNING"}, "Persistent Data is on: Blender 5.0 renders wrong until the file is opened again")
         return {"FINISHED"}
 
 
 EXISTING = (
-    ("ASK", "Ask", "Render nothing if noisy frames exist"),
-    ("KEEP", "Render Missing Frames", "Keep the existing noisy frames"),
-    ("REPLACE", "Render All Again", "Replace the existing noisy frames"),
+    ("ASK", "Ask", "Make nothing if frames exist"),
+    ("KEEP", "Keep Finished Frames", "Make what is missing, and denoise again what other settings or frames have made"),
+    ("REPLACE", "Make All Again", "Replace the existing frames"),
 )
 CHOICE = "existing='KEEP' or 'REPLACE'"  # the command line has other names
 
@@ -50,7 +48,7 @@ class Denoise(_WhenIdle, bpy.types.Operator):
         name="Render", description="Set up the passes and render the animation first", options={"SKIP_SAVE"}
     )
     existing: bpy.props.EnumProperty(
-        name="Noisy Frames", description="How to treat existing noisy frames", items=EXISTING, options={"SKIP_SAVE"}
+        name="Existing Frames", description="How to treat frames that exist", items=EXISTING, options={"SKIP_SAVE"}
     )
     wait: bpy.props.BoolProperty(
         name="Wait", description="Return at the end, for scripts", default=True, options={"SKIP_SAVE", "HIDDEN"}
@@ -59,11 +57,18 @@ class Denoise(_WhenIdle, bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Ask about existing frames; then return at once, and let a timer follow."""
         self.wait = bpy.app.background
-        if self.render and not self.wait and scenes.rendered_files(context.scene):
+        if not self.wait and (there := self._existing(context.scene)):
             self.existing = "KEEP"
-            title = "Noisy frames are there already"
-            return context.window_manager.invoke_props_dialog(self, title=title, confirm_text="Render and Denoise")
+            button = "Render and Denoise" if self.render else self.bl_label
+            return context.window_manager.invoke_props_dialog(self, title=f"{there} are there", confirm_text=button)
         return self.execute(context)
+
+    def _existing(self, scene: bpy.types.Scene) -> str:
+        """Name the frames that would be replaced; empty without any."""
+        found = {"denoised frames": scenes.denoised_frames(scene)}
+        if self.render:
+            found = {"noisy frames": scenes.rendered_files(scene), **found}
+        return " and ".join(f"{name} {frames.ranges(there)}" for name, there in found.items() if there)
 
     def draw(self, context: bpy.types.Context) -> None:
         for value, *_ in EXISTING[1:]:  # "Ask" is no answer
@@ -74,13 +79,12 @@ class Denoise(_WhenIdle, bpy.types.Operator):
         return _follow(self, context, lambda: self._begin(context.scene))
 
     def _begin(self, scene: bpy.types.Scene) -> None:
-        job, there = jobs.begin(scene), scenes.rendered_files(scene)
+        job = jobs.begin(scene, keep=self.existing == "KEEP")
+        if self.existing == "ASK" and (there := self._existing(scene)):
+            raise FileExistsError(f"{there} are there already: choose {CHOICE}")
         if not self.render:
             job.start()
             return
-        if there and self.existing == "ASK":
-            which = f"noisy frames {frames.ranges(there)} are there already"
-            raise FileExistsError(f"{which}: render with {CHOICE}, or denoise them")
         if bpy.app.is_job_running("RENDER"):  # whose settings `override` would change
             raise RuntimeError("Blender is rendering: wait for its end, or stop it")
         scenes.set_up(scene)
@@ -124,7 +128,7 @@ class Install(_WhenIdle, bpy.types.Operator):
 
 
 class Cancel(bpy.types.Operator):
-    """Stop ravg; finished frames stay, and Resume goes on from there"""
+    """Stop ravg; finished frames stay, and Denoise Frames goes on from there"""
 
     bl_idname = "ravg.cancel"
     bl_label = "Stop"
@@ -219,7 +223,12 @@ def conclude(operator: bpy.types.Operator, context: bpy.types.Context) -> set[st
     if job.scene is None:  # nothing to show: ravg was installed, or the scene was removed
         return {"FINISHED"}
     windows = [*context.window_manager.windows]
-    return _load(operator, job.scene, lambda image, count: show(windows, job.scene, image, count))
+
+    def use(image: bpy.types.Image, count: int) -> None:
+        compositor.repoint(job.scene, image, count)
+        show(windows, job.scene, image, count)
+
+    return _load(operator, job.scene, use)
 
 
 def show(windows: list[bpy.types.Window], scene: bpy.types.Scene, image: bpy.types.Image, count: int) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import bpy
 
-from . import jobs, scenes
+from . import compositor, jobs, scenes
 
 
 class OutputPanel(bpy.types.Panel):
@@ -22,7 +22,8 @@ class OutputPanel(bpy.types.Panel):
         layout.use_property_split = True
         layout.use_property_decorate = False
         job, missing = jobs.current, jobs.ravg_problem(wait=False)
-        problems = scenes.problems(scene) if job is None else []  # all frames are looked at, and a job draws often
+        # All frames are looked at, and a job draws often.
+        problems = [*scenes.problems(scene), *compositor.problems(scene)] if job is None else []
         if problems or missing:
             column = layout.box().column(align=True)
             if missing:
@@ -40,7 +41,6 @@ class OutputPanel(bpy.types.Panel):
         for name, default in (("noisy", scenes.noisy_pattern(scene)), ("folder", str(scenes.output_folder(scene)))):
             column.label(text=scene.ravg.bl_rna.properties[name].name)
             column.prop(scene.ravg, name, text="", placeholder=_shorten(default))
-        column.prop(scene.ravg, "resume")
         column = layout.column(align=True)
         if job is not None:
             column.progress(text=job.text, factor=job.factor)
@@ -53,6 +53,8 @@ class OutputPanel(bpy.types.Panel):
         column = layout.column(align=True)
         column.operator("ravg.show", icon="IMAGE_DATA")
         column.operator("ravg.add_to_compositor", icon="NODE_COMPOSITING")
+        if movie := compositor.movie(scene):
+            layout.label(text=movie, icon="RENDER_ANIMATION")
 
 
 def _shorten(path: str) -> str:
