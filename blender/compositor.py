@@ -11,12 +11,14 @@ from . import frames, scenes
 LABEL = "Denoised"  # of our image nodes; what identifies them, their property, also holds their view layer
 OURS = "ravg"
 _NAMES = {"Image": "Combined"}  # socket of a Render Layers node → socket of an Image node, where they differ
+_LAYER = {"IMAGE": "layer", "CRYPTOMATTE_V2": "layer_name"}  # types of our nodes → property of their layer
 _ENDS = ("GROUP_OUTPUT", "COMPOSITE", "OUTPUT_FILE")  # types of nodes that write or return an image
 
 
 def add(scene: bpy.types.Scene, image: bpy.types.Image, count: int) -> None:
     """Replace the scene's Render Layers nodes by the denoised frames; nodes of ours that exist are used again.
 
+    Cryptomatte nodes read their mattes from the same files.
     A Render Layers node that has no links left is muted: Blender then composites without rendering the scene again.
     Where no node leads to an output that is free, the denoised frames are linked to it. ValueError for a scene in
     stereo, or if nothing reads the frames in the end.
@@ -34,6 +36,9 @@ def add(scene: bpy.types.Scene, image: bpy.types.Image, count: int) -> None:
             if (output := node.outputs.get(_NAMES.get(name, name))) is not None:
                 render.id_data.links.new(output, link.to_socket)
         render.mute = not any(output.is_linked for output in render.outputs)
+    for _, node in list(scenes.nodes(scene)):
+        if node.type == "CRYPTOMATTE_V2" and node.source == "RENDER" and node.scene in (None, scene):
+            _show(node, node.layer_name, scene, image, count)
     if not any(_is_read(node) for node in _ours(scene)) and (end := _free_end(tree)) is not None:
         tree.links.new(_node(tree, "", scene, image, count).outputs["Combined"], end)
     if not any(_is_read(node) for node in _ours(scene)):
@@ -43,7 +48,8 @@ def add(scene: bpy.types.Scene, image: bpy.types.Image, count: int) -> None:
 def repoint(scene: bpy.types.Scene, image: bpy.types.Image, count: int) -> None:
     """Let our nodes show the frames in `image`, as links and layers are."""
     for node in _ours(scene):
-        layer = node.layer if node.has_layers else node.get(OURS, "")  # none is known where the file is gone
+        layer = getattr(node, _LAYER[node.type]) if node.has_layers else ""
+        layer = layer or node.get(OURS, "")  # unknown where the file is gone
         _show(node, layer, scene, image, count)
 
 
@@ -87,14 +93,13 @@ def movie(scene: bpy.types.Scene) -> str:
 
 
 def _ours(scene: bpy.types.Scene) -> list[bpy.types.Node]:
-    """The image nodes of denoised frames, within groups too."""
-    images = [node for _, node in scenes.nodes(scene) if node.type == "IMAGE"]
-    return [node for node in images if OURS in node or _is_old(node)]
+    """The nodes that show denoised frames, within groups too."""
+    return [node for _, node in scenes.nodes(scene) if node.type in _LAYER and (OURS in node or _is_old(node))]
 
 
 def _is_old(node: bpy.types.Node) -> bool:
     """Whether an earlier version has made a node."""
-    return node.label == LABEL and node.image is not None and node.image.source == "SEQUENCE"
+    return node.type == "IMAGE" and node.label == LABEL and node.image is not None and node.image.source == "SEQUENCE"
 
 
 def _render_layers(scene: bpy.types.Scene) -> Iterator[bpy.types.Node]:
@@ -130,7 +135,7 @@ def _node(
 ) -> bpy.types.Node:
     """Our node of a view layer in a tree, of the first one without a name, made if missing."""
     for node in _ours(scene):
-        if node.id_data == tree and (not layer or not node.has_layers or node.layer == layer):
+        if node.id_data == tree and node.type == "IMAGE" and (not layer or not node.has_layers or node.layer == layer):
             return node
     node = tree.nodes.new("CompositorNodeImage")
     node.label = LABEL
@@ -139,10 +144,12 @@ def _node(
 
 
 def _show(node: bpy.types.Node, layer: str, scene: bpy.types.Scene, image: bpy.types.Image, count: int) -> None:
-    """Let a node show the view layer of the image; the first one if it has none of that name."""
+    """Let a node show a layer of the image; the first one if it has none of that name."""
+    if node.type == "CRYPTOMATTE_V2":
+        node.source = "IMAGE"
     node.image, node[OURS] = image, layer
     with suppress(TypeError):  # no such layer, or no layers at all
-        node.layer = layer
+        setattr(node, _LAYER[node.type], layer)
     scenes.show_from(node, scene, count)
 
 

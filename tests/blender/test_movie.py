@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.blender.session import COMPOSE, PROBLEMS, Blender, channels, picture
+from tests.blender.session import COMPOSE, PROBLEMS, Blender, channels, needs_ravg, picture
 
 pytestmark = pytest.mark.cycles
 SINCE_5 = pytest.importorskip("bpy", reason="runs Blender: pip install bpy==5.0.1").app.version >= (5, 0, 0)
@@ -163,6 +163,41 @@ answer = [compositor.movie(scene), add(), compositor.movie(scene)]
     off, done, on = blender.run(code, blend=denoised)
     assert off == "Render Animation renders the noisy scene: Compositing is off"
     assert (done, on) == (["FINISHED"], "Render Animation writes the denoised frames")
+
+
+@needs_ravg
+def test_the_denoised_file_stands_for_the_render_layer(blender, blend):
+    """Mist, alpha and a matte in one picture: the same through Render Layers and through the denoised frames."""
+    code = f"""{MOVIE}
+scene.frame_end, scene.render.film_transparent, scene.ravg.preset = 5, True, "average"
+bpy.data.objects["Plane"].scale = 0.2, 0.2, 0.2
+layer = scene.view_layers[0]
+layer.use_pass_mist = layer.use_pass_diffuse_direct = layer.use_pass_cryptomatte_object = True
+bpy.ops.ravg.denoise(render=True)
+tree, end = empty_compositor()
+render, matte, three = (tree.nodes.new(f"CompositorNode{{x}}") for x in ("RLayers", "CryptomatteV2", "CombineColor"))
+matte.matte_id = "Sphere"
+tree.links.new(render.outputs["Image"], matte.inputs[0])
+for index, output in enumerate((render.outputs["Mist"], render.outputs["Alpha"], matte.outputs["Matte"])):
+    tree.links.new(output, three.inputs[index])
+tree.links.new(three.outputs[0], end.inputs[0])
+sockets = [output.name for output in render.outputs if output.enabled]
+movie("rendered")
+added = add()
+movie("denoised")
+(image,) = [node for node in ours()]
+found = [output.name for output in image.outputs]
+answer = [added, set(sockets) - set(found) - {{"Image", "Noisy Image"}}, render.mute, said(), compositor.movie(scene)]
+answer[1] = sorted(answer[1])
+"""
+    added, lacking, muted, said, movie = blender.run(code, blend=blend)
+    assert (added, lacking, muted, said) == (["FINISHED"], [], True, [])
+    assert movie == "Render Animation writes the denoised frames"
+    for frame in (4, 5):
+        rendered, denoised = (channels(blend.parent / x / f"{frame:04d}.exr") for x in ("rendered", "denoised"))
+        for c, pass_name in zip("RGB", ("mist", "alpha", "matte"), strict=True):
+            assert 0.01 < rendered[c].mean() < 0.99, pass_name
+            np.testing.assert_allclose(denoised[c], rendered[c], atol=2e-3, err_msg=pass_name)
 
 
 @pytest.mark.skipif(not SINCE_5, reason="before Blender 5.0 groups hold no Render Layers")
