@@ -1,5 +1,6 @@
 """The operators behind the panel's buttons."""
 
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -88,6 +89,9 @@ class Denoise(_WhenIdle, bpy.types.Operator):
         if bpy.app.is_job_running("RENDER"):  # whose settings `override` would change
             raise RuntimeError("Blender is rendering: wait for its end, or stop it")
         scenes.set_up(scene)
+        job.to_render = len(scenes.frame_numbers(scene))
+        if self.existing == "KEEP":
+            job.to_render -= len(scenes.rendered_files(scene))
         scenes.override(scene, replace=self.existing == "REPLACE")
         how = "EXEC_DEFAULT" if self.wait else "INVOKE_DEFAULT"
         if bpy.ops.render.render(how, animation=True, scene=scene.name) == {"CANCELLED"}:
@@ -95,16 +99,19 @@ class Denoise(_WhenIdle, bpy.types.Operator):
 
 
 class Install(_WhenIdle, bpy.types.Operator):
-    """Install ravg for Blender alone, in its configuration folder, from a wheel file"""
+    """Install ravg for Blender alone, in its configuration folder, or repair it"""
 
     bl_idname = "ravg.install"
     bl_label = "Install ravg"
 
     wheel: bpy.props.StringProperty(
         name="Wheel",
-        description="A wheel file of ravg; its requirements come from wheels beside it or from the package index",
+        description="A wheel file of ravg in place of the extension's; wheels of requirements may lie beside it",
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
+    )
+    gpu: bpy.props.BoolProperty(
+        name="For GPUs", description="Install torch with CUDA, which takes more room", options={"SKIP_SAVE"}
     )
     wait: bpy.props.BoolProperty(default=True, options={"SKIP_SAVE", "HIDDEN"})
 
@@ -117,14 +124,19 @@ class Install(_WhenIdle, bpy.types.Operator):
 
     def draw(self, context: bpy.types.Context) -> None:
         column = self.layout.column()
-        column.prop(self, "wheel", placeholder="ravg-…-py3-none-any.whl")
-        if bpy.app.online_access:
-            column.label(text="With torch, some gigabytes are downloaded")
-        else:
+        source = jobs.install_source(self.wheel, gpu=self.gpu)
+        bundled = source.wheel is not None or self.wheel
+        column.prop(self, "wheel", placeholder="the extension's own" if bundled else "ravg-…-py3-none-any.whl")
+        if not source.online:
             column.label(text="Online Access is off: wheels of all requirements are needed beside it", icon="ERROR")
+            return
+        if sys.platform == "linux":
+            column.prop(self, "gpu")
+        download, disk = source.sizes
+        column.label(text=f"Downloads about {download:g} GB, and takes {disk:g} GB on disk")
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        return _follow(self, context, lambda: jobs.begin_install(self.wheel))
+        return _follow(self, context, lambda: jobs.begin_install(self.wheel, gpu=self.gpu))
 
 
 class Cancel(bpy.types.Operator):
@@ -176,6 +188,22 @@ class Show(bpy.types.Operator):
         scene = context.scene
         here = [context.window] if context.window else []  # an editor in another window may be hidden by this one
         return _load(self, scene, lambda image, count: show(here, scene, image, count))
+
+
+class Compare(bpy.types.Operator):
+    """Play noisy, Blender's and ravg's frames side by side in the web browser: each is a layer of the left or right"""
+
+    bl_idname = "ravg.compare"
+    bl_label = "Compare"
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        try:
+            jobs.compare(context.scene)
+        except OSError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, "ravg view opens in the web browser")
+        return {"FINISHED"}
 
 
 class AddToCompositor(bpy.types.Operator):

@@ -169,25 +169,43 @@ except RuntimeError as error:
     answer = [str(error).strip(), bpy.ops.ravg.denoise.poll(), "ravg.log" in bpy.data.texts]
 """
 
-# Blender draws panels only in a window. This stands in for its layout, and refuses what Blender would.
+# Blender draws panels only in a window. This stands in for its layout: it records texts, and refuses what the layout of
+# this version of Blender would refuse.
 DRAWN = """
 from types import SimpleNamespace
-from bl_ext.user_default.ravg import jobs, panel
-icons = {i.identifier for i in bpy.types.UILayout.bl_rna.functions["label"].parameters["icon"].enum_items}
+from bl_ext.user_default.ravg import jobs, operators, panel
+functions = bpy.types.UILayout.bl_rna.functions
 drawn = []
+def operator(name):
+    return getattr(bpy.ops.ravg, name).get_rna_type()
+class Chosen:
+    def __init__(self, kind): self.__dict__["kind"] = kind
+    def __setattr__(self, name, value): assert name in self.kind.properties, name
 class Layout:
-    def row(self, **how): return self
-    box = column = row
-    def label(self, text, icon="NONE"): drawn.append(text); assert icon in icons
-    def prop(self, data, name, text=None, placeholder=""):
-        if text is None: drawn.append(data.bl_rna.properties[name].name)
-    def progress(self, text, factor): drawn.append(text); assert 0 <= factor <= 1
-    def operator(self, name, text=None, icon="NONE"):
-        kind = getattr(bpy.types, "RAVG_OT_" + name.partition(".")[2])
-        drawn.append(text or kind.bl_label); assert icon in icons
-        return SimpleNamespace()
-def draw():
+    def __getattr__(self, name):
+        parameters = {p.identifier: p for p in functions[name].parameters}
+        names = [p.identifier for p in parameters.values() if not p.is_output]
+        def call(*values, **how):
+            how.update(zip(names, values))
+            for key, value in how.items():
+                assert key in names, (name, key)
+                items = parameters[key].enum_items if parameters[key].type == "ENUM" else ()
+                assert not items or value in items, (name, key, value)
+            text = how.get("text")
+            if name == "prop":
+                text = how["data"].bl_rna.properties[how["property"]].name if text is None else None
+            elif name == "prop_enum":
+                text = how["data"].bl_rna.properties[how["property"]].enum_items[how["value"]].name
+            elif name == "operator":
+                kind = operator(how["operator"].partition(".")[2])
+                text = text or kind.name
+            elif name == "progress":
+                assert 0 <= how["factor"] <= 1
+            drawn.extend([text] if text else [])
+            return Chosen(kind) if name == "operator" else self
+        return call
+def draw(kind=panel.OutputPanel, **how):
     drawn.clear()
-    panel.OutputPanel.draw(SimpleNamespace(layout=Layout()), bpy.context)
+    kind.draw(SimpleNamespace(layout=Layout(), **how), bpy.context)
     return list(drawn)
 """

@@ -30,6 +30,7 @@ from tests.blender.session import (
     needs_ravg,
     picture,
 )
+from tests.blender.wheels import write_wheel
 
 pytestmark = pytest.mark.cycles
 SINCE_5 = pytest.importorskip("bpy", reason="runs Blender: pip install bpy==5.0.1").app.version >= (5, 0, 0)
@@ -54,7 +55,7 @@ def test_blender_would_refuse_a_wrong_one(tmp_path):
 
 def test_it_comes_and_goes_without_a_trace(blender):
     code = """
-    HANDLERS = ("load_pre", "load_post", "save_pre", "render_init", "render_complete", "render_cancel")
+    HANDLERS = ("load_pre", "load_post", "save_pre", "render_init", "render_write", "render_complete", "render_cancel")
     def traces():
         handlers = bpy.app.handlers
         return [hasattr(bpy.types.Scene, "ravg"), hasattr(bpy.types, "RAVG_PT_output"),
@@ -67,7 +68,7 @@ def test_it_comes_and_goes_without_a_trace(blender):
     """
     there, gone, again = blender.run(code, NAME=NAME)
     assert there[:3] == [True, True, True]
-    assert gone == [False, False, False, there[3] - 6]
+    assert gone == [False, False, False, there[3] - 8]
     assert again == there
 
 
@@ -919,28 +920,12 @@ def test_a_link_to_nothing_is_named_as_a_frame_that_cannot_be_read(blender, stub
 # --- installing ravg -----------------------------------------------------------------------------------
 
 
-def wheel(folder: Path, name: str, version: str, code: str, extra: str = "") -> Path:
-    """A wheel of one module, and of a command of the same name."""
-    info, path = f"{name}-{version}.dist-info", folder / f"{name}-{version}-py3-none-any.whl"
-    files = {
-        f"{name}_stub.py": code,
-        f"{info}/METADATA": f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n{extra}",
-        f"{info}/WHEEL": "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
-        f"{info}/entry_points.txt": f"[console_scripts]\n{name} = {name}_stub:main\n",
-    }
-    with zipfile.ZipFile(path, "w") as archive:
-        for inside, text in files.items():
-            archive.writestr(inside, text)
-        archive.writestr(f"{info}/RECORD", "".join(f"{inside},,\n" for inside in [*files, f"{info}/RECORD"]))
-    return path
-
-
 @pytest.fixture
 def wheels(tmp_path: Path) -> Path:
     """A wheel of ravg that does nothing but say its version, with one for its requirement beside it."""
-    code = f"def main(): print('ravg {VERSION}')\n"
-    wheel(tmp_path, "pyoidn", "2.5.1", code)
-    return wheel(tmp_path, "ravg", VERSION, code, "Provides-Extra: neural\n")
+    code = f"print('ravg {VERSION}')"
+    write_wheel(tmp_path, "pyoidn", "2.5.1", code)
+    return write_wheel(tmp_path, "ravg", VERSION, code, "Provides-Extra: neural\n")
 
 
 INSTALLING = """
@@ -963,7 +948,7 @@ def test_ravg_is_installed_from_a_wheel_replaced_and_kept_where_that_fails(blend
     bad = tmp_path / "bad"
     bad.mkdir()
     shutil.copy(wheels.parent / "pyoidn-2.5.1-py3-none-any.whl", bad)
-    wheel(bad, "ravg", VERSION, "", "Provides-Extra: neural\nRequires-Dist: gone-for-good\n")
+    write_wheel(bad, "ravg", VERSION, "", "Provides-Extra: neural\nRequires-Dist: gone-for-good\n")
     code = (
         INSTALLING
         + """
@@ -984,8 +969,66 @@ answer = [install(wheel=GOOD), there(), ran(), jobs.ravg_problem(wait=True), ins
     assert (left, still) == (["2", "current.txt"], f"ravg {VERSION}")
 
 
+def test_the_wheel_of_the_extension_is_installed_and_repairs_what_is_broken(blender, wheels, tmp_path):
+    """Blender's update removes the Python that an environment's commands begin with."""
+    code = (
+        INSTALLING
+        + """
+import shutil
+from bl_ext.user_default.ravg import install as module
+bundled = Path(module.__file__).parent / "wheels"
+shutil.copytree(WHEELS, bundled)
+try:
+    answer = [install(), ran()]
+    tool = Path(settings.executable())
+    tool.write_text("#!/gone/python3\\n" + tool.read_text().partition("\\n")[2])
+    answer += [jobs.ravg_problem(wait=True), install(), ran(), jobs.ravg_problem(wait=True)]
+finally:
+    shutil.rmtree(bundled)
+"""
+    )
+    done, version, problem, again, repaired, fine = blender.run(code, command="", WHEELS=str(wheels.parent))
+    assert done == again == ["FINISHED"]
+    assert version == repaired == f"ravg {VERSION}"
+    assert "does not start as ravg" in problem
+    assert "press Install ravg" in problem
+    assert fine == ""
+
+
+def test_an_installation_can_be_stopped_and_leaves_what_was_there(blender, wheels):
+    """The index does not answer, so that pip waits."""
+    code = (
+        INSTALLING
+        + """
+import socket
+from bl_ext.user_default.ravg import command
+silent = socket.create_server(("127.0.0.1", 0))
+os.environ["PIP_INDEX_URL"] = f"http://127.0.0.1:{silent.getsockname()[1]}/"
+bpy.context.preferences.system.use_online_access = False
+answer = [install(wheel=WHEEL), there()]
+bpy.context.preferences.system.use_online_access = True
+command.TERMINATED_AFTER = 0
+job = jobs.begin_install(WHEEL, gpu=False)
+while job._step == 0 or not job.run.log:
+    job.advance()
+    time.sleep(0.05)
+answer += [job.text, job.factor, there()]
+bpy.ops.ravg.cancel()
+while not job.ended:
+    time.sleep(0.05)
+answer += [sorted(bpy.ops.ravg.conclude()), there(), ran()]
+"""
+    )
+    done, one, text, factor, two, stopped, left, version = blender.run(code, command="", WHEEL=str(wheels))
+    assert done == ["FINISHED"]
+    assert text.startswith("Installing ravg, 0%: Looking in ")
+    assert 0 < factor < 1
+    assert len(two) == len(one) + 1
+    assert (stopped, left, version) == (["CANCELLED"], one, f"ravg {VERSION}")
+
+
 def test_without_a_wheel_or_a_network_the_error_says_so(blender, tmp_path):
-    needy = wheel(tmp_path, "ravg", VERSION, "", "Provides-Extra: neural\nRequires-Dist: torch\n")
+    needy = write_wheel(tmp_path, "ravg", VERSION, "", "Provides-Extra: neural\nRequires-Dist: torch\n")
     code = (
         INSTALLING
         + """
@@ -1117,50 +1160,3 @@ def test_a_render_that_does_not_start_is_an_error_and_leaves_the_settings(
 def test_there_is_nothing_to_show_before_it_has_run(blender, shot):
     code = FAILING.replace("ravg.denoise()", "ravg.show()")
     assert "no denoised frames" in blender.run(code, blend=shot)[0]
-
-
-# --- the panel -----------------------------------------------------------------------------------------
-
-
-def test_the_panel_of_a_new_scene_is_that_of_the_documentation(blender, blend):
-    text = (ROOT / "docs" / "blender.md").read_text(encoding="utf-8")
-    block = re.search(r"```\n(Denoising Data.*?)\n```", text, re.DOTALL)
-    assert block
-    code = DRAWN + "scene.cycles.use_denoising = True; answer = draw()"  # as in a new file
-    assert blender.run(code, blend=blend) == block[1].splitlines()
-
-
-def test_an_output_path_that_blender_cannot_read_leaves_the_panel_whole(blender, stub, rendered):
-    code = DRAWN + "scene.render.filepath = '//{no_such}/x_'; answer = draw()"
-    assert "Render and Denoise" in blender.run(code, blend=rendered, command=stub)
-
-
-def test_the_panel_of_a_job_shows_how_far_it_is_and_a_way_to_stop_it(blender, stub, rendered):
-    begin = "from bl_ext.user_default.ravg import scenes; jobs.begin(scene); scenes.override(scene, replace=True)"
-    code = f"{DRAWN}{begin}; answer = draw()"
-    drawn = blender.run(code, blend=rendered, command=stub)
-    assert drawn == ["Preset", "Light Passes", "Noisy Frames", "Denoised Frames", "Rendering", "Stop"]
-
-
-def test_the_panel_of_a_job_looks_at_no_frame(blender, shot, tmp_path):
-    """It is drawn four times a second and more: looking at a thousand frames on a server would take longer."""
-    tool = tmp_path / "ravg"
-    listens = f"print('ravg {VERSION}')\nif 'denoise' in sys.argv: sys.stdin.read()\n"
-    tool.write_text(f"#!{sys.executable}\nimport sys\n{listens}", encoding="utf-8")
-    tool.chmod(0o755)
-    code = f"""{DRAWN}
-scene.frame_end = 7
-job = jobs.begin(scene)
-job.start()
-jobs.follow()
-looked = []
-sys.addaudithook(lambda event, found: looked.append(str(found)) if event == "os.listdir" else None)
-stat = Path.stat
-Path.stat = lambda path, **how: looked.append(str(path)) or stat(path, **how)
-answer = [draw()[-2:], [path for path in looked if "frames" in path]]
-Path.stat = stat
-jobs.stop_current()
-"""
-    drawn, looked = blender.run(code, blend=shot, command=str(tool))
-    assert drawn == ["Denoising: 0 of 3 frames", "Stop"]
-    assert looked == []
