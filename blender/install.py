@@ -19,7 +19,7 @@ _NO_NETWORK = re.compile(
 # The package index has torch with CUDA alone for Linux; PyTorch's own index has it for CPUs.
 _TORCH_FOR_CPUS = "https://download.pytorch.org/whl/cpu"
 # GB to download and on disk, measured on Linux.
-_FOR_CPUS, _FOR_GPUS = (0.5, 1.9), (3.0, 6.3)
+_FOR_CPUS, _FOR_GPUS = (0.4, 1.8), (3.0, 6.3)
 
 
 class Source(NamedTuple):

@@ -89,11 +89,11 @@ scene = bpy.context.scene
 answer += [draw()]
 """
     rendered, rendering, denoised, composited, unsaved = blender.run(code, blend=shot, command=stub)
-    first = "3 frames from noisy frames; the first run measures the time"
+    first = "3 frames from Blender's denoised frames; the first run measures the time"
     begin = ["Render and Denoise", "Denoise Frames"]
     assert rendered == [*SETTINGS, first, *begin, "3 of 3 noisy frames are there, 0 are denoised", *BUTTONS]
     assert rendering == [*SETTINGS, "Rendering: 1 of 3 frames, 40 seconds left", "Stop"]
-    again = ["3 frames, about 2 seconds each, 6 seconds, from noisy frames", *begin]
+    again = ["3 frames, about 2 seconds each, 6 seconds, from Blender's denoised frames", *begin]
     again += ["3 of 3 noisy frames are there, 3 are denoised", *BUTTONS]
     assert denoised == [*SETTINGS, *again, "Render Animation renders the noisy scene"]
     assert composited == [*SETTINGS, *again, "Render Animation writes the denoised frames"]
@@ -113,7 +113,7 @@ for online in (False, True):
     assert existing == ["Keep Finished Frames", "Make All Again"]
     assert offline == ["Wheel", "Online Access is off: wheels of all requirements are needed beside it"]
     choice = ["For GPUs"] if sys.platform == "linux" else []
-    assert cpu == ["Wheel", *choice, "Downloads about 0.5 GB, and takes 1.9 GB on disk"]
+    assert cpu == ["Wheel", *choice, "Downloads about 0.4 GB, and takes 1.8 GB on disk"]
     assert (gpu != cpu) == (sys.platform == "linux")
 
 
