@@ -13,13 +13,17 @@ CLASSES = (
     operators.Cancel,
     operators.Conclude,
     operators.Show,
+    operators.Compare,
     operators.AddToCompositor,
     panel.OutputPanel,
 )
 HANDLERS = (
     ("load_pre", jobs.stop_current),
+    ("load_pre", jobs.end_viewer),
     ("load_post", jobs.restore_all),
+    ("save_pre", jobs.make_relative),
     ("render_init", jobs.protect),
+    ("render_write", jobs.count_written),
     ("render_complete", jobs.completed),
     ("render_cancel", jobs.cancelled),
 )
@@ -37,6 +41,7 @@ def register() -> None:
 
 def unregister() -> None:
     jobs.stop_current()
+    jobs.end_viewer()
     bpy.utils.unregister_cli_command(_command.pop())
     for name, handler in HANDLERS:
         getattr(bpy.app.handlers, name).remove(handler)

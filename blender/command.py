@@ -78,17 +78,17 @@ class Run:
     """A running command whose output goes to `log`; raises OSError if the command cannot be started.
 
     `outputs` are the files that it will write. Each is renamed into its place when complete, so that counting them
-    measures the progress, but for frames that `--resume` leaves alone.
+    measures the progress, but for frames that `--resume` leaves alone. `variables` are further ones of the environment.
     """
 
-    def __init__(self, arguments: Sequence[str], outputs: Iterable[Path], log: Path) -> None:
+    def __init__(self, arguments: Sequence[str], outputs: Iterable[Path], log: Path, **variables: str) -> None:
         self._before = {path: _version(path) for path in outputs}
         self._log = log
         self._stopped_at: float | None = None
         with log.open("wb") as sink:
             self._process = subprocess.Popen(
                 list(arguments), stdin=subprocess.PIPE, stdout=sink, stderr=subprocess.STDOUT,
-                env={**os.environ, **_PLAIN, **_STOPPABLE}, **_windowless(),
+                env={**os.environ, **_PLAIN, **_STOPPABLE, **variables}, **_windowless(),
             )  # fmt: skip
 
     @property

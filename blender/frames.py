@@ -58,6 +58,14 @@ def refusal(path: Path, *, cycles: bool) -> str:
     return ""
 
 
+def is_denoised_too(path: Path) -> bool:
+    """Whether a frame holds the picture that Blender has denoised, beside its noisy one."""
+    try:
+        return any(".Noisy Image." in name for name in read_header(path)[1])
+    except (OSError, ValueError):
+        return False
+
+
 def read_header(path: Path) -> tuple[set[str], set[str]]:
     """Return the names of attributes and channels of an OpenEXR file; OSError or ValueError if it cannot be read."""
     attributes: set[str] = set()

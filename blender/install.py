@@ -4,6 +4,7 @@ import os
 import re
 import shutil
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,21 +16,38 @@ _NO_NETWORK = re.compile(
 )
 
 
+# The package index has torch with CUDA alone for Linux; PyTorch's own index has it for CPUs.
+_TORCH_FOR_CPUS = "https://download.pytorch.org/whl/cpu"
+# GB to download and on disk, measured on Linux.
+_FOR_CPUS, _FOR_GPUS = (0.4, 1.8), (3.0, 6.3)
+
+
 class Source(NamedTuple):
     version: str  # of this extension, such as 0.2.0
     wheel: Path | None  # of ravg; its requirements are taken from wheels in its folder
     online: bool  # whether requirements may come from the package index too
+    gpu: bool  # whether torch is to compute on GPUs: on Linux alone, pip's torch for other systems is for CPUs
 
-    def requirements(self) -> list[str]:
-        """Return pip's arguments. FileNotFoundError or ValueError for a wrong wheel or none."""
+    @property
+    def sizes(self) -> tuple[float, float]:
+        """GB to download and on disk."""
+        return _FOR_GPUS if self.gpu and sys.platform == "linux" else _FOR_CPUS
+
+    def requirements(self) -> list[list[str]]:
+        """Return pip's arguments for each of its runs. FileNotFoundError or ValueError for a wrong wheel or none."""
         if self.wheel is None:  # ravg is on no package index, where anybody could publish the name
             raise ValueError(f"choose a wheel file of ravg, such as ravg-{self.version}-py3-none-any.whl")
         if not self.wheel.is_file():
             raise FileNotFoundError(f"no wheel file {self.wheel}")
         if not re.fullmatch(r"ravg-[^-]+-.+\.whl", self.wheel.name):
             raise ValueError(f"{self.wheel.name} is no wheel of ravg, expected a name like ravg-{self.version}-….whl")
-        found = [f"--find-links={self.wheel.parent}", f"ravg[neural] @ {self.wheel.absolute().as_uri()}", "pyoidn"]
-        return found if self.online else ["--no-index", *found]
+        links = f"--find-links={self.wheel.parent}"
+        ravg = [links, f"ravg[neural] @ {self.wheel.absolute().as_uri()}", "pyoidn"]
+        if not self.online:
+            return [["--no-index", *ravg]]
+        if sys.platform == "linux" and not self.gpu:
+            return [[f"--index-url={_TORCH_FOR_CPUS}", links, "torch"], ravg]
+        return [ravg]
 
 
 def series(version: str) -> str:
@@ -37,24 +55,52 @@ def series(version: str) -> str:
     return ".".join(version.split(".")[:2])
 
 
+def bundled_wheel() -> Path | None:
+    """The wheel that the extension came with; None in a clone."""
+    return next(iter(sorted((Path(__file__).parent / "wheels").glob("ravg-*.whl"))), None)
+
+
 def new_environment(home: Path) -> Path:
-    """A folder for a new environment; the current one stays until the new one is complete."""
+    """A new folder for an environment; the current one stays until the new one is complete."""
+    current = _current(home)
+    for name in _environments(home):
+        if name != current:  # left by Blender's end during an installation
+            remove(home / name)
     numbers = [int(name.rpartition("-")[2]) for name in _environments(home)]
     # A short name: Windows takes paths of 259 letters. Torch needs 119 in site-packages, and a user's name may be long.
-    return home / str(max(numbers, default=0) + 1)
+    made = home / str(max(numbers, default=0) + 1)
+    temporary(made).mkdir(parents=True)
+    return made
+
+
+def temporary(environment: Path) -> Path:
+    """The folder of pip's downloads: /tmp may be small, and the environment is removed as a whole."""
+    return environment / "tmp"
+
+
+def size(environment: Path) -> float:
+    """GB of an environment so far."""
+    total = 0
+    for folder, _, names in os.walk(environment):
+        for name in names:
+            with suppress(OSError):  # removed meanwhile
+                total += os.lstat(os.path.join(folder, name)).st_size
+    return total / 1e9
 
 
 def steps(environment: Path, source: Source) -> list[list[str]]:
     """The commands that make an environment, in their order; raises as `Source.requirements` does."""
     # Isolated (-I): ignore any ravg in Blender's folder or path.
     pip = [_program(environment, "python"), "-I", "-m", "pip", "install", "--no-input", "--disable-pip-version-check"]
-    pip += ["--progress-bar=off", "--retries=1", "--timeout=15", *source.requirements()]
+    pip += ["--progress-bar=off", "--retries=1", "--timeout=15"]
     make = [sys.executable, "-I", "-m", "venv", os.fspath(environment)]
-    return [make, pip, [_program(environment, "ravg"), "--version"]]
+    runs = [[*pip, *words] for words in source.requirements()]
+    return [make, *runs, [_program(environment, "ravg"), "--version"]]
 
 
 def finish(home: Path, environment: Path) -> None:
     """Make an environment the current one, and remove all others."""
+    remove(temporary(environment))
     mark = home / f"{_CURRENT}.new"
     mark.write_text(environment.name, encoding="utf-8")
     os.replace(mark, home / _CURRENT)
@@ -70,12 +116,16 @@ def remove(environment: Path) -> None:
 
 def installed(home: Path) -> str:
     """The command ravg of the current environment; empty if there is none."""
+    name = _current(home)
+    found = _program(home / name, "ravg")
+    return found if name and os.path.isfile(found) else ""
+
+
+def _current(home: Path) -> str:
     try:
-        name = (home / _CURRENT).read_text(encoding="utf-8")
+        return (home / _CURRENT).read_text(encoding="utf-8")
     except OSError:
         return ""
-    found = _program(home / name, "ravg")
-    return found if os.path.isfile(found) else ""
 
 
 def explain(log: str, *, online: bool) -> str:

@@ -8,24 +8,28 @@ from typing import Any
 
 import bpy
 
-from . import command, frames, install, scenes, settings
+from . import command, compositor, forecast, frames, install, scenes, settings
 
 INTERVAL = 0.25  # seconds between two updates
+MEASURE_EVERY = 2.0  # seconds between two looks at an installation, whose files are ten thousands
 LOG = "ravg.log"  # the text block that holds ravg's output
 Report = Callable[[set[str], str], None]
 WIDTH = 160  # letters of an error: Blender shows one line, cut off at its window
 
 
 class Job:
-    """A scene being denoised; `run` is None while Blender renders its frames."""
+    """A scene being denoised; `run` is None while Blender renders its frames. `keep`: finished frames stay."""
 
-    def __init__(self, scene: bpy.types.Scene) -> None:
+    def __init__(self, scene: bpy.types.Scene, *, keep: bool = False) -> None:
         self._scene = scene.session_uid  # a name may change
+        self._keep = keep
         if reason := ravg_problem(wait=True):
             raise FileNotFoundError(reason)
         if reason := scenes.misplaced(scene):
             raise FileNotFoundError(reason)
         self.run: command.Run | None = None
+        self._started = time.monotonic()
+        self.to_render = self.written = 0  # frames
         self.rendered = False
         self.cancelled = False
         self.error = ""
@@ -47,12 +51,12 @@ class Job:
             raise FileNotFoundError("the scene was removed")
         there = list(scenes.rendered_files(scene))
         pattern = scenes.noisy_pattern(scene)
-        if not there:
-            raise FileNotFoundError(f"no frames {pattern}: Render and Denoise renders them")
         if scene.ravg.light_passes and scene.ravg.preset == "average":
             raise ValueError(scenes.NO_LIGHT_PASSES)
         if reason := scenes.refused(scene):
             raise ValueError(f"{reason} ({Path(pattern).parent})")
+        if not there:
+            raise FileNotFoundError(f"no frames {pattern}: Render and Denoise renders them")
         chosen, folder = scene.ravg, scenes.output_folder(scene)
         average = ["--method=classical", "--first-pass=auto"]
         how = average if chosen.preset == "average" else [f"--preset={chosen.preset}"]
@@ -60,11 +64,12 @@ class Job:
         arguments += [f"--output={folder}", f"--frames={frames.ranges(there)}"]
         if chosen.light_passes:
             arguments.append("--aov=all")
-        if chosen.resume:
+        if self._keep:
             arguments.append("--resume")
         outputs = scenes.denoised_files(scene)
         self._folder = folder
         log = Path(bpy.app.tempdir) / "ravg.log"
+        self._started = time.monotonic()
         self.run = command.Run(arguments, [outputs[number] for number in there], log)
 
     def advance(self) -> None:
@@ -83,13 +88,16 @@ class Job:
     @property
     def factor(self) -> float:
         """The progress, from 0 to 1."""
-        return 0.0 if self.run is None else self._finished / self.run.total
+        done, total = (self.written, self.to_render) if self.run is None else (self._finished, self.run.total)
+        return min(done / max(total, 1), 1.0)  # more are written where files vanish meanwhile
 
     @property
     def text(self) -> str:
         """The progress in words."""
         if self.run is None:
-            return "Rendering"
+            text = f"Rendering: {self.written} of {self.to_render} frames"
+            left = (self.to_render - self.written) * (time.monotonic() - self._started) / max(self.written, 1)
+            return f"{text}, {forecast.duration(left)} left" if self.written else text
         text = f"Denoising: {self._finished} of {self.run.total} frames"
         return f"{text}, {self._remaining} left" if self._remaining else text
 
@@ -119,6 +127,8 @@ class Job:
             why = textwrap.shorten(self.run.error, WIDTH, placeholder="…")
             report({"ERROR"}, f"{why} (all of it in the text {LOG})")
             return False
+        if self.scene is not None and not self._keep:
+            forecast.learn(self.scene, (time.monotonic() - self._started) / self.run.total)
         report({"INFO"}, f"Denoised {self.run.total} frames into {self._folder}")
         return True
 
@@ -132,23 +142,25 @@ class Install:
 
     scene = None
 
-    def __init__(self, wheel: str) -> None:
-        path = Path(bpy.path.abspath(wheel)) if wheel else None
-        source = install.Source(settings.version(), path, bpy.app.online_access)
-        self._online = source.online
+    def __init__(self, wheel: str, *, gpu: bool) -> None:
+        self._source = install_source(wheel, gpu=gpu)
+        self._source.requirements()  # raises for a wrong wheel, before anything is made
         self._home = settings.home()
-        self._home.mkdir(parents=True, exist_ok=True)
         self._environment = install.new_environment(self._home)
-        self._steps = install.steps(self._environment, source)
+        self._steps = install.steps(self._environment, self._source)
         self._step = 0
         self._error = ""
+        self._size, self._measured = 0.0, -MEASURE_EVERY
         self.run = self._start()
 
     def _start(self) -> command.Run:
-        return command.Run(self._steps[self._step], [], Path(bpy.app.tempdir) / f"ravg-install-{self._step}.log")
+        log = Path(bpy.app.tempdir) / f"ravg-install-{self._step}.log"
+        return command.Run(self._steps[self._step], [], log, TMPDIR=str(install.temporary(self._environment)))
 
     def advance(self) -> None:
-        """Start the next step after a successful one."""
+        """Measure the progress; start the next step after a successful one."""
+        if time.monotonic() - self._measured >= MEASURE_EVERY:
+            self._size, self._measured = install.size(self._environment), time.monotonic()
         if self.run.code == 0 and not self.run.stopped and self._step < len(self._steps) - 1:
             self._step += 1
             try:
@@ -158,14 +170,14 @@ class Install:
 
     @property
     def factor(self) -> float:
-        """The share of finished steps; the time of a download is unknown."""
-        return self._step / len(self._steps)
+        """The share of bytes that are there, of those downloaded and unpacked in the end."""
+        return min(self._size / sum(self._source.sizes), 0.99)
 
     @property
     def text(self) -> str:
-        """The progress in words: pip's last line."""
-        lines = [line.strip() for line in self.run.log.splitlines() if line.strip()]
-        return f"Installing ravg: {lines[-1][:80]}" if lines else "Installing ravg"
+        """The progress in words: bytes and pip's last line."""
+        lines = [line.strip() for line in self.run.log.splitlines() if line.strip()] or [""]
+        return f"Installing ravg, {self.factor:.0%}: {lines[-1][:80]}"
 
     def cancel(self) -> None:
         self.run.stop()
@@ -185,13 +197,14 @@ class Install:
         if self.run.stopped:
             report({"WARNING"}, "Stopped: ravg is not installed")
         else:
-            why = self._error or install.explain(self.run.log, online=self._online)
+            why = self._error or install.explain(self.run.log, online=self._source.online)
             why = textwrap.shorten(why, WIDTH, placeholder="…")
             report({"ERROR"}, f"ravg is not installed: {why} (all of it in the text {LOG})")
         return False
 
 
 current: Job | Install | None = None
+viewer: command.Run | None = None  # `ravg view`
 _version: command.Version | None = None
 
 
@@ -246,17 +259,46 @@ def wait() -> None:
         current.advance()
 
 
-def begin(scene: bpy.types.Scene) -> Job:
+def begin(scene: bpy.types.Scene, *, keep: bool = False) -> Job:
     """Make the current job; FileNotFoundError if the command is missing, or the frames have no folder."""
     global current
-    current = Job(scene)
+    current = Job(scene, keep=keep)
     return current
 
 
-def begin_install(wheel: str) -> Install:
+def compare(scene: bpy.types.Scene) -> None:
+    """Start `ravg view` on the scene's frames; OSError without frames, or if the command cannot be started."""
+    global viewer
+    if not scenes.denoised_frames(scene):
+        raise FileNotFoundError(f"no denoised frames in {scenes.output_folder(scene)}")
+    end_viewer()
+    noisy = Path(scenes.noisy_pattern(scene))
+    arguments = [settings.executable(), "view", str(scenes.output_folder(scene) / noisy.name)]
+    if scenes.rendered_files(scene):
+        arguments += ["--beside", str(noisy)]
+    viewer = command.Run(arguments, [], Path(bpy.app.tempdir) / "ravg-view.log")
+
+
+@bpy.app.handlers.persistent
+def end_viewer(*_: Any) -> None:
+    """End `ravg view`, as its file or the extension is closed."""
+    global viewer
+    if viewer is not None:
+        viewer.stop()
+        viewer.wait()
+        viewer = None
+
+
+def install_source(wheel: str, *, gpu: bool) -> install.Source:
+    """Where ravg is installed from: a wheel, or the one that the extension came with."""
+    path = Path(bpy.path.abspath(wheel)) if wheel else install.bundled_wheel()
+    return install.Source(settings.version(), path, bpy.app.online_access, gpu)
+
+
+def begin_install(wheel: str, *, gpu: bool) -> Install:
     """Begin to install ravg; ValueError or OSError without a source, or if no environment can be made."""
     global current, _version
-    current, _version = Install(wheel), None
+    current, _version = Install(wheel, gpu=gpu), None
     return current
 
 
@@ -276,17 +318,36 @@ def stop_current(*_: Any) -> None:
 
 @bpy.app.handlers.persistent
 def restore_all(*_: Any) -> None:
-    """Restore the settings of all scenes of a file that was saved during a render."""
+    """Restore all scenes of a file: settings as they were before a render, frames that have moved with the file."""
     for scene in bpy.data.scenes:
         scenes.restore(scene)
+        try:
+            compositor.repoint_lost(scene)
+        except (OSError, RuntimeError) as error:  # RuntimeError: Blender's, of an unreadable file
+            print(f"ravg: {error}")
+
+
+@bpy.app.handlers.persistent
+def make_relative(file: str, *_: Any) -> None:
+    """Let a file be moved with its frames."""
+    scenes.make_relative(file)
 
 
 @bpy.app.handlers.persistent
 def protect(scene: bpy.types.Scene, *_: Any) -> None:
     """Keep ravg's frames when a render that is not its own would overwrite them."""
     if not scene.ravg.lent:
-        for message in scenes.keep_existing(scene):
-            print(f"ravg: {message}")
+        problems = [problem.text for problem in compositor.problems(scene)]
+        for message in (*scenes.keep_existing(scene), *problems, compositor.movie(scene)):
+            if message:
+                print(f"ravg: {message}")
+
+
+@bpy.app.handlers.persistent
+def count_written(scene: bpy.types.Scene, *_: Any) -> None:
+    """Count the frames that a job's render has written."""
+    if (job := _waiting(scene)) is not None:
+        job.written += 1
 
 
 # Handlers run in another thread while Blender still reads the scene. They leave to the timer what belongs to a job, and

@@ -1,5 +1,6 @@
 """The operators behind the panel's buttons."""
 
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -18,15 +19,13 @@ class SetUp(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         changed = scenes.set_up(context.scene)
         self.report({"INFO"}, f"Set up: {', '.join(changed)}" if changed else "All is set up already")
-        if changed and context.scene.render.use_persistent_data:
-            self.report({"WARNING"}, "Persistent Data is on: Blender 5.0 renders wrong until the file is opened again")
         return {"FINISHED"}
 
 
 EXISTING = (
-    ("ASK", "Ask", "Render nothing if noisy frames exist"),
-    ("KEEP", "Render Missing Frames", "Keep the existing noisy frames"),
-    ("REPLACE", "Render All Again", "Replace the existing noisy frames"),
+    ("ASK", "Ask", "Make nothing if frames exist"),
+    ("KEEP", "Keep Finished Frames", "Make what is missing, and denoise again what other settings or frames have made"),
+    ("REPLACE", "Make All Again", "Replace the existing frames"),
 )
 CHOICE = "existing='KEEP' or 'REPLACE'"  # the command line has other names
 
@@ -50,7 +49,7 @@ class Denoise(_WhenIdle, bpy.types.Operator):
         name="Render", description="Set up the passes and render the animation first", options={"SKIP_SAVE"}
     )
     existing: bpy.props.EnumProperty(
-        name="Noisy Frames", description="How to treat existing noisy frames", items=EXISTING, options={"SKIP_SAVE"}
+        name="Existing Frames", description="How to treat frames that exist", items=EXISTING, options={"SKIP_SAVE"}
     )
     wait: bpy.props.BoolProperty(
         name="Wait", description="Return at the end, for scripts", default=True, options={"SKIP_SAVE", "HIDDEN"}
@@ -59,11 +58,18 @@ class Denoise(_WhenIdle, bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Ask about existing frames; then return at once, and let a timer follow."""
         self.wait = bpy.app.background
-        if self.render and not self.wait and scenes.rendered_files(context.scene):
+        if not self.wait and (there := self._existing(context.scene)):
             self.existing = "KEEP"
-            title = "Noisy frames are there already"
-            return context.window_manager.invoke_props_dialog(self, title=title, confirm_text="Render and Denoise")
+            button = "Render and Denoise" if self.render else self.bl_label
+            return context.window_manager.invoke_props_dialog(self, title=f"{there} are there", confirm_text=button)
         return self.execute(context)
+
+    def _existing(self, scene: bpy.types.Scene) -> str:
+        """Name the frames that would be replaced; empty without any."""
+        found = {"denoised frames": scenes.denoised_frames(scene)}
+        if self.render:
+            found = {"noisy frames": scenes.rendered_files(scene), **found}
+        return " and ".join(f"{name} {frames.ranges(there)}" for name, there in found.items() if there)
 
     def draw(self, context: bpy.types.Context) -> None:
         for value, *_ in EXISTING[1:]:  # "Ask" is no answer
@@ -74,16 +80,18 @@ class Denoise(_WhenIdle, bpy.types.Operator):
         return _follow(self, context, lambda: self._begin(context.scene))
 
     def _begin(self, scene: bpy.types.Scene) -> None:
-        job, there = jobs.begin(scene), scenes.rendered_files(scene)
+        job = jobs.begin(scene, keep=self.existing == "KEEP")
+        if self.existing == "ASK" and (there := self._existing(scene)):
+            raise FileExistsError(f"{there} are there already: choose {CHOICE}")
         if not self.render:
             job.start()
             return
-        if there and self.existing == "ASK":
-            which = f"noisy frames {frames.ranges(there)} are there already"
-            raise FileExistsError(f"{which}: render with {CHOICE}, or denoise them")
         if bpy.app.is_job_running("RENDER"):  # whose settings `override` would change
             raise RuntimeError("Blender is rendering: wait for its end, or stop it")
         scenes.set_up(scene)
+        job.to_render = len(scenes.frame_numbers(scene))
+        if self.existing == "KEEP":
+            job.to_render -= len(scenes.rendered_files(scene))
         scenes.override(scene, replace=self.existing == "REPLACE")
         how = "EXEC_DEFAULT" if self.wait else "INVOKE_DEFAULT"
         if bpy.ops.render.render(how, animation=True, scene=scene.name) == {"CANCELLED"}:
@@ -91,16 +99,19 @@ class Denoise(_WhenIdle, bpy.types.Operator):
 
 
 class Install(_WhenIdle, bpy.types.Operator):
-    """Install ravg for Blender alone, in its configuration folder, from a wheel file"""
+    """Install ravg for Blender alone, in its configuration folder, or repair it"""
 
     bl_idname = "ravg.install"
     bl_label = "Install ravg"
 
     wheel: bpy.props.StringProperty(
         name="Wheel",
-        description="A wheel file of ravg; its requirements come from wheels beside it or from the package index",
+        description="A wheel file of ravg in place of the extension's; wheels of requirements may lie beside it",
         subtype="FILE_PATH",
         options={"SKIP_SAVE"},
+    )
+    gpu: bpy.props.BoolProperty(
+        name="For GPUs", description="Install torch with CUDA, which takes more room", options={"SKIP_SAVE"}
     )
     wait: bpy.props.BoolProperty(default=True, options={"SKIP_SAVE", "HIDDEN"})
 
@@ -113,18 +124,23 @@ class Install(_WhenIdle, bpy.types.Operator):
 
     def draw(self, context: bpy.types.Context) -> None:
         column = self.layout.column()
-        column.prop(self, "wheel", placeholder="ravg-…-py3-none-any.whl")
-        if bpy.app.online_access:
-            column.label(text="With torch, some gigabytes are downloaded")
-        else:
+        source = jobs.install_source(self.wheel, gpu=self.gpu)
+        bundled = source.wheel is not None or self.wheel
+        column.prop(self, "wheel", placeholder="the extension's own" if bundled else "ravg-…-py3-none-any.whl")
+        if not source.online:
             column.label(text="Online Access is off: wheels of all requirements are needed beside it", icon="ERROR")
+            return
+        if sys.platform == "linux":
+            column.prop(self, "gpu")
+        download, disk = source.sizes
+        column.label(text=f"Downloads about {download:g} GB, and takes {disk:g} GB on disk")
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        return _follow(self, context, lambda: jobs.begin_install(self.wheel))
+        return _follow(self, context, lambda: jobs.begin_install(self.wheel, gpu=self.gpu))
 
 
 class Cancel(bpy.types.Operator):
-    """Stop ravg; finished frames stay, and Resume goes on from there"""
+    """Stop ravg; finished frames stay, and Denoise Frames goes on from there"""
 
     bl_idname = "ravg.cancel"
     bl_label = "Stop"
@@ -174,6 +190,22 @@ class Show(bpy.types.Operator):
         return _load(self, scene, lambda image, count: show(here, scene, image, count))
 
 
+class Compare(bpy.types.Operator):
+    """Play noisy, Blender's and ravg's frames side by side in the web browser: each is a layer of the left or right"""
+
+    bl_idname = "ravg.compare"
+    bl_label = "Compare"
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        try:
+            jobs.compare(context.scene)
+        except OSError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.report({"INFO"}, "ravg view opens in the web browser")
+        return {"FINISHED"}
+
+
 class AddToCompositor(bpy.types.Operator):
     """Replace the Render Layers nodes by the denoised frames, so that the scene is not rendered again"""
 
@@ -219,7 +251,12 @@ def conclude(operator: bpy.types.Operator, context: bpy.types.Context) -> set[st
     if job.scene is None:  # nothing to show: ravg was installed, or the scene was removed
         return {"FINISHED"}
     windows = [*context.window_manager.windows]
-    return _load(operator, job.scene, lambda image, count: show(windows, job.scene, image, count))
+
+    def use(image: bpy.types.Image, count: int) -> None:
+        compositor.repoint(job.scene, image, count)
+        show(windows, job.scene, image, count)
+
+    return _load(operator, job.scene, use)
 
 
 def show(windows: list[bpy.types.Window], scene: bpy.types.Scene, image: bpy.types.Image, count: int) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import bpy
 
-from . import jobs, scenes
+from . import compositor, forecast, jobs, scenes
 
 
 class OutputPanel(bpy.types.Panel):
@@ -22,15 +22,16 @@ class OutputPanel(bpy.types.Panel):
         layout.use_property_split = True
         layout.use_property_decorate = False
         job, missing = jobs.current, jobs.ravg_problem(wait=False)
-        problems = scenes.problems(scene) if job is None else []  # all frames are looked at, and a job draws often
+        # All frames are looked at, and a job draws often.
+        problems = [*scenes.problems(scene), *compositor.problems(scene)] if job is None else []
         if problems or missing:
             column = layout.box().column(align=True)
             if missing:
-                _warn(context, column, missing)
+                _text(context, column, missing)
                 if job is None:
                     column.operator("ravg.install", icon="IMPORT")
             for problem in problems:
-                _warn(context, column, problem.text)
+                _text(context, column, problem.text)
             if any(problem.fixable for problem in problems):
                 column.operator("ravg.set_up", icon="TOOL_SETTINGS")
         column = layout.column()
@@ -40,19 +41,26 @@ class OutputPanel(bpy.types.Panel):
         for name, default in (("noisy", scenes.noisy_pattern(scene)), ("folder", str(scenes.output_folder(scene)))):
             column.label(text=scene.ravg.bl_rna.properties[name].name)
             column.prop(scene.ravg, name, text="", placeholder=_shorten(default))
-        column.prop(scene.ravg, "resume")
         column = layout.column(align=True)
         if job is not None:
             column.progress(text=job.text, factor=job.factor)
             column.operator("ravg.cancel", icon="X")
             return
+        _text(context, column, forecast.line(scene), "INFO")
         column.operator("ravg.denoise", text="Render and Denoise", icon="RENDER_ANIMATION").render = True
         column.operator("ravg.denoise", icon="SHADERFX")
-        there, total = len(scenes.rendered_files(scene)), len(scenes.frame_numbers(scene))
-        layout.label(text=f"{there} of {total} noisy frames are there", icon="FILE_IMAGE")
+        total, there, made = (
+            len(x(scene)) for x in (scenes.frame_numbers, scenes.rendered_files, scenes.denoised_frames)
+        )
+        layout.label(text=f"{there} of {total} noisy frames are there, {made} are denoised", icon="FILE_IMAGE")
         column = layout.column(align=True)
         column.operator("ravg.show", icon="IMAGE_DATA")
+        column.operator("ravg.compare", icon="MOD_MIRROR")
+        if jobs.viewer is not None and jobs.viewer.code:
+            _text(context, column, f"ravg view: {jobs.viewer.error}")
         column.operator("ravg.add_to_compositor", icon="NODE_COMPOSITING")
+        if movie := compositor.movie(scene):
+            layout.label(text=movie, icon="RENDER_ANIMATION")
 
 
 def _shorten(path: str) -> str:
@@ -62,11 +70,11 @@ def _shorten(path: str) -> str:
     return f"//{Path(path).relative_to(folder).as_posix()}" if below else path
 
 
-def _warn(context: bpy.types.Context, column: bpy.types.UILayout, text: str) -> None:
+def _text(context: bpy.types.Context, column: bpy.types.UILayout, text: str, icon: str = "ERROR") -> None:
     """Draw a text, wrapped at the panel's width, where Blender would cut it off."""
     # A letter is about seven pixels wide; without a region nothing is wrapped.
     width = 200
     if context.region is not None:
         width = max(20, int(context.region.width / (7 * context.preferences.system.ui_scale)) - 6)
     for index, line in enumerate(textwrap.wrap(text, width, break_on_hyphens=False)):
-        column.label(text=line, icon="BLANK1" if index else "ERROR")
+        column.label(text=line, icon="BLANK1" if index else icon)

@@ -20,7 +20,10 @@ except ImportError:
 
 NO_LIGHT_PASSES = "Without Network does not denoise them, choose another preset or switch Light Passes off"
 # Seen with Blender 5.0.1: the left view of a multi-view OpenEXR image in all views.
-STEREO = "Blender's compositor shows the left eye's image in both: composite the frames in another program"
+STEREO = (
+    "Stereo: Blender's compositor shows the left eye's image in both, and Render Animation renders the noisy scene: "
+    "composite the denoised frames in another program"
+)
 
 
 class Problem(NamedTuple):
@@ -49,12 +52,15 @@ def _of_frames(scene: bpy.types.Scene) -> Iterator[Problem]:
     if 0 < len(missing) < len(frame_numbers(scene)):
         yield Problem(f"Frames {frames.ranges(missing)} are missing: Render and Denoise renders them", False)
     if scene.render.use_multiview:
-        yield Problem(f"Stereo: both eyes are denoised, but {STEREO}", False)
+        yield Problem(STEREO, False)
     if scene.render.use_sequencer and scene.sequence_editor is not None and _strips(scene):
         remedy = "switch Post Processing > Sequencer off for the movie"
         yield Problem(f"Sequencer has strips: Render Animation renders those, {remedy}", False)
     if not scene.ravg.lent and would_be_written_over(scene):  # `override` sets this path for ravg's own render
         yield Problem("Output Path is that of ravg's frames: Render Animation skips them, name another", False)
+    elif not scene.ravg.lent and _mixes(scene):
+        text = "Output Path leads into the folder of ravg's frames: the movie mixes with them, name another"
+        yield Problem(text, False)
     if nodes := file_outputs(scene):
         text = f"{', '.join(nodes.values())}: the folder is that of ravg's frames, and nothing is written, name another"
         yield Problem(text, False)
@@ -66,6 +72,9 @@ def _of_passes(scene: bpy.types.Scene) -> Iterator[Problem]:
     if render.engine != "CYCLES":
         yield Problem("Engine is not Cycles: its noise is not of the kind that ravg removes, choose Cycles", False)
         return
+    if scene.frame_step > 1:
+        text = "Frame Step is not 1: the Vector pass leads to frames that are missing, Blender's own frames are better"
+        yield Problem(f"{text}: set it to 1, or do not denoise them", False)
     layers = _layers(scene)
     if any(not layer.cycles.denoising_store_passes for layer in layers):
         yield Problem("Denoising Data is off: textures blur, and noise that Blender removed is lost", True)
@@ -108,7 +117,16 @@ def set_up(scene: bpy.types.Scene) -> list[str]:
     if _wrong_denoise(scene):
         scene.cycles.use_denoising = not scene.cycles.use_denoising
         changed.append("Denoise" if scene.cycles.use_denoising else "no Denoise")
+    if changed:
+        forget_data(scene)
     return changed
+
+
+def forget_data(scene: bpy.types.Scene) -> None:
+    """Drop the data that Persistent Data has kept: with other passes, Blender would render wrong images from it."""
+    if scene.render.use_persistent_data:
+        scene.render.use_persistent_data = False
+        scene.render.use_persistent_data = True
 
 
 def _wrong_denoise(scene: bpy.types.Scene) -> bool:
@@ -130,12 +148,21 @@ def noisy_files(scene: bpy.types.Scene) -> dict[int, Path]:
 
 def rendered_files(scene: bpy.types.Scene) -> dict[int, Path]:
     """Frame number → file of the noisy render, for existing files; lists their folder once."""
-    files = noisy_files(scene) if is_placed(scene) else {}
-    try:
-        there = set(os.listdir(Path(noisy_pattern(scene)).parent))
-    except OSError:
-        there = set()
+    return _existing(noisy_files(scene)) if is_placed(scene) else {}
+
+
+def _existing(files: dict[int, Path]) -> dict[int, Path]:
+    """Return the files that exist, all of one folder."""
+    there = _names(next(iter(files.values())).parent) if files else set()
     return {number: path for number, path in files.items() if path.name in there}
+
+
+def _names(folder: Path) -> set[str]:
+    """The names in a folder, if it exists."""
+    try:
+        return set(os.listdir(folder))
+    except OSError:
+        return set()
 
 
 def noisy_pattern(scene: bpy.types.Scene) -> str:
@@ -147,7 +174,7 @@ def noisy_pattern(scene: bpy.types.Scene) -> str:
 def output_folder(scene: bpy.types.Scene) -> Path:
     """The folder of the denoised frames: the scene's setting, or ``denoised`` beside the noisy frames."""
     if scene.ravg.folder:
-        return _absolute(scene.ravg.folder)
+        return absolute(scene.ravg.folder)
     noisy = Path(noisy_pattern(scene)).parent
     return (noisy if scene.ravg.noisy else noisy.parent) / "denoised"
 
@@ -156,6 +183,18 @@ def denoised_files(scene: bpy.types.Scene) -> dict[int, Path]:
     """Frame number → denoised file, existing or not."""
     folder = output_folder(scene)
     return {number: folder / path.name for number, path in noisy_files(scene).items()}
+
+
+def denoised_frames(scene: bpy.types.Scene) -> dict[int, Path]:
+    """Frame number → denoised file, for existing files; lists their folder once."""
+    return _existing(denoised_files(scene)) if is_placed(scene) else {}
+
+
+def is_denoised(scene: bpy.types.Scene, path: Path) -> bool:
+    """Whether a path is that of a denoised frame, existing or not, of whatever number."""
+    before, _, after = _name(scene)
+    pattern = rf"{re.escape(os.path.basename(before))}\d+{re.escape(after)}"
+    return path.parent == output_folder(scene) and bool(re.fullmatch(pattern, path.name))
 
 
 def is_placed(scene: bpy.types.Scene) -> bool:
@@ -170,15 +209,20 @@ def misplaced(scene: bpy.types.Scene) -> str:
         return "Noisy Frames has { or }: ravg fills in no variables of Blender, write out the path"
     # Without a file, other paths lead to the folder that Blender was started in.
     paths = chosen.noisy, chosen.folder or chosen.noisy
-    if bpy.data.filepath or all(os.path.isabs(path) and not path.startswith("//") for path in paths):
-        return ""
-    return "File is not saved: save it, or write out the paths of Noisy Frames and Denoised Frames"
+    if not bpy.data.filepath and not all(map(_is_absolute, paths)):
+        return "File is not saved: save it, or write out the paths of Noisy Frames and Denoised Frames"
+    if output_folder(scene) == Path(noisy_pattern(scene)).parent:
+        return "Denoised Frames is the folder of the noisy frames: choose another"
+    return ""
 
 
 def refused(scene: bpy.types.Scene) -> str:
     """Return which file on disk is no noisy frame, and why; empty if all are."""
     cycles = scene.render.engine == "CYCLES"
-    for path in rendered_files(scene).values():
+    there = rendered_files(scene)
+    if not there and (name := _other_format(scene)):
+        return f"{name} is no noisy frame: ravg reads passes, which only OpenEXR MultiLayer files have"
+    for path in there.values():
         try:
             reason = _refusal(path, path.stat().st_mtime_ns, cycles)
         except OSError as error:  # a link to nothing, or a file that was removed meanwhile
@@ -186,6 +230,17 @@ def refused(scene: bpy.types.Scene) -> str:
         if reason:
             return f"{path.name} is no noisy frame: {reason}"
     return ""
+
+
+def _other_format(scene: bpy.types.Scene) -> str:
+    """The first picture of another format that is named as a noisy frame but for the ending; empty without one."""
+    if not is_placed(scene):
+        return ""
+    stems = {path.stem for path in noisy_files(scene).values()}  # the setting itself may end in ".png"
+    names = _names(Path(noisy_pattern(scene)).parent)
+    formats = set(bpy.path.extensions_image) - {".exr"}
+    found = (x for x in names if Path(x).suffix.lower() in formats and {x, Path(x).stem} & stems)
+    return min(found, default="")
 
 
 @functools.lru_cache(maxsize=1 << 14)
@@ -200,41 +255,54 @@ def would_be_written_over(scene: bpy.types.Scene) -> list[Path]:
         return []
     kept = {*noisy_files(scene).values(), *denoised_files(scene).values()}
     try:
-        first = _absolute(scene.render.frame_path(frame=scene.frame_start))
+        first = absolute(scene.render.frame_path(frame=scene.frame_start))
         if first.parent not in {path.parent for path in kept}:  # the common case, made fast for the panel
             return []
-        written = {_absolute(scene.render.frame_path(frame=number)) for number in frame_numbers(scene)}
+        written = {absolute(scene.render.frame_path(frame=number)) for number in frame_numbers(scene)}
     except RuntimeError:  # an invalid path template, to which Blender does not render either
         return []
     return sorted(path for path in kept & written if path.is_file())
 
 
+def _mixes(scene: bpy.types.Scene) -> bool:
+    """Whether Render Animation writes other files into a folder of ravg's frames."""
+    if not is_placed(scene):
+        return False
+    kept = {*noisy_files(scene).values(), *denoised_files(scene).values()}
+    try:
+        written = absolute(scene.render.frame_path(frame=scene.frame_start))
+    except RuntimeError:  # an invalid path template, to which Blender does not render either
+        return False
+    return written not in kept and written.parent in {path.parent for path in kept}
+
+
 def file_outputs(scene: bpy.types.Scene) -> dict[str, str]:
     """Path in the scene of a File Output node that writes to a folder of ravg's frames → the node's name."""
-    name = "compositing_node_group" if hasattr(scene, "compositing_node_group") else "node_tree"  # since Blender 5.0
-    tree = getattr(scene, name)
-    if tree is None or not is_placed(scene):
+    if not is_placed(scene):
         return {}
     kept = Path(noisy_pattern(scene)).parent, output_folder(scene)
-    found = _file_output_nodes(tree, name, set())
     return {
         path: node.name
-        for path, node in found
-        if any(folder.match(pattern) for pattern in _folders(node) for folder in kept)
+        for path, node in nodes(scene)
+        if node.type == "OUTPUT_FILE" and any(folder.match(pattern) for pattern in _folders(node) for folder in kept)
     }
 
 
-def _file_output_nodes(
-    tree: bpy.types.NodeTree, where: str, seen: set[bpy.types.NodeTree]
-) -> Iterator[tuple[str, bpy.types.Node]]:
-    """Yield the File Output nodes of a tree and of the groups in it, each tree once, with their paths in the scene."""
+def nodes(scene: bpy.types.Scene) -> Iterator[tuple[str, bpy.types.Node]]:
+    """Yield the compositor's nodes, those of groups too, with their paths in the scene."""
+    name = "compositing_node_group" if hasattr(scene, "compositing_node_group") else "node_tree"  # since Blender 5.0
+    if (tree := getattr(scene, name)) is not None:
+        yield from _nodes(tree, name, set())
+
+
+def _nodes(tree: bpy.types.NodeTree, where: str, seen: set[bpy.types.NodeTree]) -> Iterator[tuple[str, bpy.types.Node]]:
+    """Yield the nodes of a tree and of the groups in it, each tree once, with their paths in the scene."""
     seen.add(tree)
     for node in tree.nodes:
         path = f'{where}.nodes["{bpy.utils.escape_identifier(node.name)}"]'
-        if node.type == "OUTPUT_FILE":
-            yield path, node
-        elif (inner := getattr(node, "node_tree", None)) is not None and inner not in seen:
-            yield from _file_output_nodes(inner, f"{path}.node_tree", seen)
+        yield path, node
+        if (inner := getattr(node, "node_tree", None)) is not None and inner not in seen:
+            yield from _nodes(inner, f"{path}.node_tree", seen)
 
 
 def _folders(node: bpy.types.Node) -> Iterator[str]:
@@ -247,7 +315,7 @@ def _folders(node: bpy.types.Node) -> Iterator[str]:
         base, names = node.base_path, [slot.path for slot in node.file_slots]
     for name in names:
         # A name may begin with a folder, and be empty after it. Blender joins both, whatever the name begins with.
-        path = _absolute(os.path.join(_absolute(base or "/"), f"{name}_".lstrip("/\\")))
+        path = absolute(os.path.join(absolute(base or "/"), f"{name}_".lstrip("/\\")))
         # Since Blender 5.0 braces hold variables, which may stand for any name.
         yield re.sub(r"\{[^{}]*\}", "*", glob.escape(str(path.parent)))
 
@@ -275,8 +343,9 @@ def override(scene: bpy.types.Scene, *, replace: bool) -> None:
     if scene.render.use_multiview:  # both eyes in one file, which ravg denoises both
         settings["render.image_settings.views_format"] = "MULTIVIEW"
     _override(scene, settings)
+    forget_data(scene)
     first = scene.frame_start
-    written, expected = _absolute(scene.render.frame_path(frame=first)), noisy_files(scene)[first]
+    written, expected = absolute(scene.render.frame_path(frame=first)), noisy_files(scene)[first]
     if written != expected:
         restore(scene)
         raise OSError(f"Blender would write {written}, expected {expected}: give Noisy Frames a plainer name")
@@ -346,18 +415,34 @@ def _name(scene: bpy.types.Scene) -> tuple[str, int, str]:
     before, width, after = re.fullmatch(r"(.*?)(#*)([^#]*)", name, re.DOTALL).groups()
     if not width:
         before, after = name, ""
-    return os.path.join(_absolute(folder or "//"), before), len(width) or 4, f"{after}.exr"
+    return os.path.join(absolute(folder or "//"), before), len(width) or 4, f"{after}.exr"
 
 
 def load_denoised(scene: bpy.types.Scene) -> tuple[bpy.types.Image, int]:
     """Load the denoised frames as an image sequence; return it and its length. FileNotFoundError without frames."""
-    there = [path for path in denoised_files(scene).values() if path.is_file()]
+    there = denoised_frames(scene)
     if not there:
         raise FileNotFoundError(f"no denoised frames in {output_folder(scene)}")
-    image = bpy.data.images.load(str(there[0]), check_existing=True)
+    path = str(next(iter(there.values())))
+    image = bpy.data.images.load(path, check_existing=True)
     image.source = "SEQUENCE"
+    if bpy.data.filepath and not _is_absolute(scene.ravg.folder or scene.ravg.noisy):
+        image.filepath = bpy.path.relpath(path)  # moves along with the file, as the settings do
     image.reload()
     return image, scene.frame_end - scene.frame_start + 1
+
+
+def make_relative(file: str) -> None:
+    """Write the paths below the folder of the file to be saved as relative ones: the folder may be moved."""
+    folder = os.path.join(os.path.dirname(file), "")
+    for scene in bpy.data.scenes if file else ():
+        for name in ("noisy", "folder"):
+            if (path := getattr(scene.ravg, name)).startswith(folder):
+                setattr(scene.ravg, name, f"//{path[len(folder) :]}")
+
+
+def _is_absolute(path: str) -> bool:
+    return os.path.isabs(path) and not path.startswith("//")
 
 
 def show_from(user: bpy.types.ImageUser | bpy.types.Node, scene: bpy.types.Scene, count: int) -> None:
@@ -396,6 +481,6 @@ def _is_animated(scene: bpy.types.Scene, path: str) -> bool:
     return any(curve.data_path == path for curve in curves)
 
 
-def _absolute(path: str) -> Path:
+def absolute(path: str) -> Path:
     # Blender reads a backslash as the system's separator, as in a file that was saved on Windows.
     return Path(os.path.abspath(bpy.path.abspath(path).replace("\\", os.sep)))

@@ -14,6 +14,9 @@ PRESETS = (
     ("average", "Without Network", "Temporal average of frames denoised by OIDN: needs no torch"),
 )
 
+# Blender 5.0 warns of "//" in a property that does not state this; earlier ones do not know it.
+_RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set()
+
 
 class Preferences(bpy.types.AddonPreferences):
     """Edit > Preferences > Add-ons."""
@@ -44,21 +47,18 @@ class SceneSettings(bpy.types.PropertyGroup):
         name="Noisy Frames",
         description="Path of the noisy frames, written as an Output Path; default: beside the file",
         subtype="FILE_PATH",
+        options={"ANIMATABLE", *_RELATIVE},
     )
     folder: bpy.props.StringProperty(
         name="Denoised Frames",
         description="Folder of the denoised frames; default: a folder denoised beside that of the noisy frames",
         subtype="DIR_PATH",
+        options={"ANIMATABLE", *_RELATIVE},
     )
     lent: bpy.props.StringProperty(
         name="Lent Settings",
         description="The scene's own render settings, as JSON, while ravg's render overrides them",
         options={"HIDDEN"},
-    )
-    resume: bpy.props.BoolProperty(
-        name="Resume",
-        description="Skip frames that an earlier run with these settings has finished",
-        default=False,
     )
 
 

@@ -16,7 +16,7 @@ def run(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(prog=f"blender --background FILE --command {NAME}", description=__doc__)
     parser.add_argument("--render", action="store_true", help="set up the passes and render the animation first")
     existing = parser.add_mutually_exclusive_group()
-    for choice, text in (("keep", "render only the frames that are missing"), ("replace", "render all frames again")):
+    for choice, text in (("keep", "make only the frames that are missing"), ("replace", "make all frames again")):
         existing.add_argument(f"--{choice}", dest="existing", action="store_const", const=choice.upper(), help=text)
     try:
         chosen = parser.parse_args(arguments)

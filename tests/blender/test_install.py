@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import os
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from tests.blender.wheels import write_wheel
 
 SOURCE = Path(__file__).parents[2] / "blender" / "install.py"
 spec = importlib.util.spec_from_file_location("ravg_blender_install", SOURCE)
@@ -39,7 +43,6 @@ def test_a_new_environment_replaces_the_old_one_at_its_end_only(tmp_path, old):
     install.finish(tmp_path, environment(tmp_path, old))
     new = install.new_environment(tmp_path)
     assert new.name == "10"
-    environment(tmp_path, "10")
     install.remove(new)
     assert Path(install.installed(tmp_path)).parts[-3] == old
     install.finish(tmp_path, environment(tmp_path, "10"))
@@ -50,6 +53,24 @@ def test_paths_on_windows_leave_room_for_a_name_of_26_letters(tmp_path):
     home = "C:/Users/{}/AppData/Roaming/Blender Foundation/Blender/5.0/extensions/.user/user_default/ravg"
     longest = f"{home.format('u' * 26)}/{install.new_environment(tmp_path).name}/Lib/site-packages/{'t' * 119}"
     assert len(longest) <= 259
+
+
+def test_what_an_interrupted_installation_has_left_is_removed_by_the_next(tmp_path):
+    install.finish(tmp_path, environment(tmp_path, "1"))
+    environment(tmp_path, "2")
+    made = install.new_environment(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1", made.name, "current.txt"]
+    assert install.temporary(made).is_dir()
+    install.finish(tmp_path, made)
+    assert sorted(path.name for path in tmp_path.rglob("*")) == [made.name, "current.txt"], "no downloads either"
+
+
+def test_the_size_of_an_environment_is_that_of_its_files(tmp_path):
+    assert install.size(tmp_path) == 0
+    (tmp_path / "lib").mkdir()
+    (tmp_path / "lib" / "torch").write_bytes(bytes(3000))
+    (tmp_path / "gone").symlink_to("nowhere")
+    assert install.size(tmp_path) == pytest.approx(3e-6, rel=0.02)
 
 
 def test_an_environment_that_was_removed_is_not_used(tmp_path):
@@ -64,11 +85,58 @@ def test_the_index_is_asked_only_where_that_is_allowed_and_never_for_ravg(tmp_pa
     wheel.touch()
     for online in (True, False):
         with pytest.raises(ValueError, match=r"choose a wheel file of ravg, such as ravg-0\.1\.4-py3"):
-            install.Source("0.1.4", None, online).requirements()
-        asked = install.Source("0.1.4", wheel, online).requirements()
-        assert [word for word in asked if word.startswith("ravg")] == [f"ravg[neural] @ {wheel.as_uri()}"]
-    assert "--no-index" in install.Source("0.1.4", wheel, False).requirements()
-    assert "--no-index" not in install.Source("0.1.4", wheel, True).requirements()
+            install.Source("0.1.4", None, online, False).requirements()
+        runs = install.Source("0.1.4", wheel, online, False).requirements()
+        named = [word for asked in runs for word in asked if word.startswith("ravg")]
+        assert named == [f"ravg[neural] @ {wheel.as_uri()}"]
+        assert all(("--no-index" in asked) != online for asked in runs)
+
+
+@pytest.mark.parametrize(
+    ("platform", "gpu", "first", "disk"),
+    [("linux", False, 1, 1.8), ("linux", True, 0, 6.3), ("win32", True, 0, 1.8), ("darwin", False, 0, 1.8)],
+)
+def test_linux_gets_torch_for_cpus_unless_it_is_for_gpus(tmp_path, monkeypatch, platform, gpu, first, disk):
+    wheel = tmp_path / "ravg-0.1.0-py3-none-any.whl"
+    wheel.touch()
+    monkeypatch.setattr(install.sys, "platform", platform)
+    source = install.Source("0.1.4", wheel, True, gpu)
+    runs = source.requirements()
+    assert [f"--index-url={install._TORCH_FOR_CPUS}" in asked for asked in runs] == [True] * first + [False]
+    assert source.sizes[1] == disk
+
+
+def index(folder: Path, wheel: Path) -> str:
+    """A package index of one wheel; its address."""
+    project = folder / wheel.name.partition("-")[0]
+    project.mkdir(parents=True)
+    (project / "index.html").write_text(f'<a href="{wheel.as_uri()}">{wheel.name}</a>', encoding="utf-8")
+    return folder.as_uri()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="pip's torch for other systems is for CPUs")
+def test_pip_takes_torch_from_the_index_for_cpus(tmp_path, monkeypatch):
+    """With pip itself, and wheels that hold nothing: the default index has a newer torch, for GPUs."""
+    pytest.importorskip("pip", reason="installs with pip")
+    beside = tmp_path / "beside"
+    for folder in ("beside", "cpu", "gpu"):
+        (tmp_path / folder).mkdir()
+    cpu = write_wheel(tmp_path / "cpu", "torch", "2.6.0+cpu", "")
+    gpu = write_wheel(tmp_path / "gpu", "torch", "2.7.0", "")
+    write_wheel(beside, "pyoidn", "2.5.1", "")
+    ravg = write_wheel(beside, "ravg", "0.1.0", "print('ravg 0.1.0')", "Provides-Extra: neural\nRequires-Dist: torch\n")
+    monkeypatch.setattr(install, "_TORCH_FOR_CPUS", index(tmp_path / "for-cpus", cpu))
+    for name in [name for name in os.environ if name.startswith("PIP_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
+    monkeypatch.setenv("PIP_INDEX_URL", index(tmp_path / "for-gpus", gpu))
+    made = install.new_environment(tmp_path / "home")
+    for words in install.steps(made, install.Source("0.1.0", ravg, True, False)):
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.strip() == "ravg 0.1.0"
+    assert [path.name for path in made.rglob("torch-*.dist-info")] == ["torch-2.6.0+cpu.dist-info"]
 
 
 @pytest.mark.parametrize(

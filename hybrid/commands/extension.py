@@ -1,0 +1,67 @@
+"""`ravg blender-extension`: the extension for Blender as one file, with the wheel of ravg inside."""
+
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from configparser import ConfigParser
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import typer
+
+from hybrid.commands.options import command
+from hybrid.files.replace import replace_file
+
+ROOT = Path(__file__).parents[2]
+FILES = ("LICENSE", "NOTICE", "README.md", "pyproject.toml", "setup.cfg")  # what the wheel is built from, but packages
+
+
+@command("blender-extension")
+def blender_extension(output: str) -> None:
+    """Build the wheel, and write it with the extension's files."""
+    source = ROOT / "blender"
+    if not (source / "blender_manifest.toml").is_file():
+        raise FileNotFoundError(f"no folder {source}: the extension is made in a clone, after pip install -e .")
+    with tempfile.TemporaryDirectory() as folder:
+        wheel = _build_wheel(Path(folder))
+        target = Path(output)
+        if target.suffix != ".zip":
+            target /= f"ravg-{wheel.name.split('-')[1]}.zip"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with replace_file(target) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+            for path in sorted([*source.glob("*.py"), source / "blender_manifest.toml"]):
+                archive.write(path, path.name)
+            archive.write(wheel, f"wheels/{wheel.name}")
+    typer.echo(f"{target}\nIn Blender: Edit > Preferences > Get Extensions > Install from Disk…")
+
+
+def _build_wheel(folder: Path) -> Path:
+    """Build the wheel from a copy of the packages, since building leaves files in its tree."""
+    tree = folder / "tree"
+    tree.mkdir()
+    config = ConfigParser()
+    config.read(ROOT / "setup.cfg", encoding="utf-8")
+    packages = [name.rstrip("*") for name in config["options.packages.find"]["include"].split()]
+    for name in (*FILES, *packages):
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copyfile(ROOT / name, tree / name)
+    words = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder)]
+    if _has_setuptools():  # else pip downloads it
+        words.append("--no-build-isolation")
+    done = subprocess.run([*words, str(tree)], capture_output=True, encoding="utf-8", errors="replace", check=False)
+    if done.returncode:
+        lines = [line for line in done.stderr.splitlines() if line.strip()] or ["no message"]
+        raise OSError(f"pip has not built the wheel of ravg: {lines[-1]}")
+    return next(folder.glob("*.whl"))
+
+
+def _has_setuptools() -> bool:
+    """Whether this environment has the setuptools that pyproject.toml asks for."""
+    try:
+        return int(version("setuptools").split(".")[0]) >= 77
+    except PackageNotFoundError:
+        return False
