@@ -77,6 +77,13 @@ def prefilter_guides(guides: Mapping[str, Array], quality: Quality = "balanced")
     }
 
 
+def denoise_alpha(alpha: Array) -> Array:
+    """Denoise alpha (H, W, 1) in [0, 1] as gray: with OIDN's network of albedo, or else the bundled network."""
+    gray = np.repeat(np.clip(alpha, 0, 1), 3, axis=-1)
+    clean = prefilter_guides({"albedo": gray})["albedo"] if has_oidn_networks() else denoise_bundled(gray)
+    return np.clip(clean.mean(axis=-1, keepdims=True), 0, 1)
+
+
 def bundled_preset(quality: Quality) -> str:
     """The preset whose backbone replaces OIDN of this quality where OIDN is not installed."""
     return "fast" if quality == "fast" else "balanced"
