@@ -54,6 +54,9 @@ VARIANCE = 4.0
 # filter and denoisers make neighbours alike), and by a share of the brightest frame around it, whose light leaks into a
 # dark one.
 LIGHT, ERRORS, LEAK = 2.5, 10.0, 0.05
+# Log curves of cameras and ACEScct encode black as 0.07 to 0.125, and all light below 1.5. Pixels without light then
+# share the least value: at least this share of the picture. Blender's gray world, 0.051, is not in the range.
+LOG_BLACK, LOG_WHITE, LOG_SHARE = (0.06, 0.13), 1.5, 1e-3
 LOST = 0.01  # share of its pixels that an estimate may have lost
 SHOWN = 6  # number of motion conventions that are listed
 # Two pictures of which so many pixels are equal are the same, black pixels excluded: empty areas of all layers agree.
@@ -243,11 +246,13 @@ class _Checks:
         self.variances: list[Array] = []
         self.passes: list[Frame] = []
         self.pictures: list[tuple[Array, Array]] = []
+        self.log_blacks: list[float | None] = []
 
     def add(self, *frames: Frame, done: Callable[[], object] = lambda: None) -> None:
         """Check one frame, or two neighbours; `done` is called when a layer has been read."""
         for frame in frames:
             thin = _thin(frame)
+            self.log_blacks.append(_find_log_black(thin.color))
             if frame.aovs:
                 self.passes.append(sample_rows(frame))
             for role, check in _CHECKS.items():
@@ -275,6 +280,11 @@ class _Checks:
         variance_scale, variance_findings = self._scale_variance()
         factors, grade_findings = self._grade_estimate()
         findings = [*variance_findings, *grade_findings]
+        blacks = [black for black in self.log_blacks if black is not None]
+        if blacks and len(blacks) == len(self.log_blacks):
+            words = f"looks encoded by a log curve (black is {blacks[0]:.3f}, nothing is above {LOG_WHITE:g}): averages"
+            words += " of it are too dark; write scene-linear color, or convert it (oiiotool --colorconvert)"
+            findings.append(Finding("color", f"{self._name('color')} {words}", left_out=False))
         for role, messages in self.wrong.items():
             if all(messages):
                 findings.append(self._leave_out(role, str(messages[0])))
@@ -365,6 +375,15 @@ def _thin(frame: Frame) -> Frame:
     roles = ("color", *_CHECKS)
     layers = {role: layer[::step, ::step] for role in roles if (layer := getattr(frame, role)) is not None}
     return Frame(frame.number, **layers)
+
+
+def _find_log_black(color: Array) -> float | None:
+    """The value of black in a color that seems to be encoded by a log curve; None in others."""
+    least, greatest = float(color.min()), float(color.max())
+    if not (LOG_BLACK[0] <= least <= LOG_BLACK[1] and greatest <= LOG_WHITE and greatest > LOG_BLACK[1]):
+        return None
+    black = (color <= least * (1 + SAME)).all(axis=-1)
+    return least if black.mean() >= LOG_SHARE else None
 
 
 def _shrink(layer: Array) -> Array:

@@ -112,6 +112,7 @@ class FrameFacts:
     noise_free: float  # share of the tiles without noise, in [0, 1]
     samples: float | None  # samples per pixel, if known
     noise_correlation: Correlation | None = None  # of the noise; None if unknown
+    alpha_grain: float = 0.0  # median noise, or texture, of alpha where all of 3×3 pixels are partly transparent
 
 
 @dataclass(frozen=True)
@@ -192,6 +193,7 @@ def measure_frame(frame: PreparedFrame, small: SmallFrame) -> FrameFacts:
         transparent=None if frame.alpha is None else float(np.mean(frame.alpha < 0.999)),
         noise_free=_noise_free_share(small),
         samples=frame.samples,
+        alpha_grain=0.0 if frame.alpha is None else _alpha_grain(frame.alpha),
     )
 
 
@@ -640,6 +642,16 @@ def _guide_grain(guides: Sequence[Array]) -> float | None:
     for bent, level in map(_second_differences, guides):
         grain, shown = np.maximum(grain, np.abs(bent).max(axis=-1)), shown | (level != 0).any(axis=-1)
     return float(np.quantile(grain[shown], 0.75)) if shown.any() else 0.0
+
+
+def _alpha_grain(alpha: Array) -> float:
+    """Median of the second differences of alpha (H, W, 1) within soft shadows and rims, which outlines are not."""
+    partly = (alpha[..., 0] > 0) & (alpha[..., 0] < 1)
+    if np.count_nonzero(partly) < FEW:
+        return 0.0
+    soft = cv2.erode(partly.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    bent = np.abs(second_differences(alpha)[..., 0][soft]) / np.float32(6)
+    return float(np.median(bent)) if len(bent) >= FEW else 0.0
 
 
 def _noise(light: Array) -> float:

@@ -11,6 +11,7 @@ from hybrid.alignment.transfer import compress
 from hybrid.alignment.window import AlignedWindow
 from hybrid.files.frame import Array
 from hybrid.files.passes import BEAUTY
+from hybrid.neural.oidn_networks import denoise_alpha
 from nlm.average import average
 from nlm.parts import add_light, filter_layers, split_light
 
@@ -80,7 +81,8 @@ def share_out(aligned: AlignedWindow, filtered: dict[str, Array], irradiance: Ar
     for name in aovs:
         if name == ALPHA:
             centre_alpha = aligned.aovs[name][aligned.centre]
-            aovs[name] = np.where(_is_uniform(centre_alpha), centre_alpha, aovs[name])
+            clean = denoise_alpha(aovs[name]) if "clean-alpha" in aligned.stages else aovs[name]
+            aovs[name] = np.where(_is_uniform(centre_alpha), centre_alpha, clean)
         elif name not in aligned.pass_colors and (factor := factors[name]) is not None:
             aovs[name] = aovs[name] * factor
     return SharedLight(aovs, images[BEAUTY], frozenset(name for found in sums for name in found.parts))

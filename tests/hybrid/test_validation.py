@@ -298,6 +298,24 @@ def test_an_estimate_of_another_level_is_brought_to_that_of_the_samples(factor, 
         assert after.mean() == pytest.approx(shot.read(10).color.mean(), rel=0.03)
 
 
+@pytest.mark.parametrize("encoded", [True, False])
+def test_color_behind_a_log_curve_is_named(encoded: bool, tmp_path: Path) -> None:
+    """It was averaged as if it were light: 3 % too dark, without a word."""
+
+    def encode(index: int, layers: dict[str, np.ndarray]) -> None:
+        light = layers[LIGHT]
+        light[:, :20] = 0 if encoded else 0.051  # Blender's gray world is no log curve's black
+        if encoded:  # ACEScct
+            linear = light <= 0.0078125
+            logarithm = (np.log2(np.maximum(light, 0.0078125)) + 9.72) / 17.52
+            light[:] = np.where(linear, 10.5402377 * light + 0.0729055, logarithm)
+
+    findings = validate_layers(open_shot(Scene(height=64, width=96).write(tmp_path, edit=encode))).findings
+    said = [finding.message for finding in findings if finding.role == "color"]
+    assert len(said) == encoded
+    assert not encoded or "looks encoded by a log curve (black is 0.073, nothing is above 1.5)" in said[0]
+
+
 def test_what_makes_sense_gives_no_finding() -> None:
     judgement = validate_layers(open_shot(SHOT / "noisy.####.exr"))
     assert judgement.findings == ()

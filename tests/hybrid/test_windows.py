@@ -379,3 +379,23 @@ def test_estimates_whose_light_drifts_are_pulled_to_the_centre_and_samples_are_n
     off = [abs(gated_average(window)[PART].mean(dtype=float) / light - 1) for window in (pulled, plain)]
     assert off[1] > 0.006
     assert off[0] < 0.6 * off[1]
+
+
+def test_neighbours_count_by_their_samples(tmp_path):
+    """A frame of 512 samples among frames of 8 lost 2.9 dB to its neighbours."""
+
+    def grain(index, layers):
+        noise = np.random.default_rng(index).normal(1, 0.04 if index == ODD else 0.32, (180, 240, 1))
+        layers["ViewLayer.Combined"] *= noise.astype(np.float32)
+
+    scene = replace(CALM, height=180, width=240, noise=0.001)
+    shot = open_shot(scene.write(tmp_path / "a", edit=grain), frames="1007-1011")
+    stream = FrameStream(shot, Rules(), PerFrame(lambda frame: frame.color))
+    # 1 / 64, known to a fifth of it or so; a frame of fewer samples counts its neighbours in full.
+    assert stream.window(1009).samples == pytest.approx([1 / 64, 1 / 64, 1, 1 / 64, 1 / 64], rel=0.4)
+    assert stream.window(1010).samples == (1, 1, 1, 1, 1)
+    results = dict.fromkeys((1008, 1009, 1010), np.ones((180, 240, 3), np.float32))
+    assert stream.window_of_results(1009, results).samples == pytest.approx([1 / 64, 1, 1 / 64], rel=0.4)
+    aligned = stream.align(1009)
+    assert aligned.confidence[[0, 1, 3, 4]].max() < 1.4 / 64
+    assert aligned.confidence[2].min() == 1

@@ -133,6 +133,31 @@ def test_alpha_is_filtered_but_not_as_light(tmp_path, weights):
     assert alpha.std() < 0.5 * window.aovs["alpha"][2].std()
 
 
+def test_noise_of_alpha_is_filtered_in_space(tmp_path):
+    """Grain of a shadow catcher stayed: alpha was averaged over time alone, here over the one frame there is."""
+    clean = np.clip(np.linspace(-0.5, 1.5, 128, dtype=np.float32), 0, 1)[None, :, None]
+
+    def catch(index, layers):
+        noise = np.random.default_rng(index).normal(0, 0.3, (96, 128, 1)) * np.sqrt(clean * (1 - clean))
+        alpha = np.clip(clean + noise, 0, 1).astype(np.float32)
+        layers["ViewLayer.Combined"] = np.concatenate([layers["ViewLayer.Combined"], alpha], axis=-1)
+
+    scene = Scene(frames=1, height=96, width=128)
+    stages = STAGES | {"alpha"}
+    rms = {}
+    for stage in ("clean-alpha", "skip"):
+        stream = FrameStream(
+            open_shot(scene.write(tmp_path, edit=catch)), only(stages | {stage}), first_pass=Classical(DRAFT), radius=2
+        )
+        window = stream.align(scene.first)
+        alpha = open_network("fast")(window).aovs["alpha"]
+        assert 0 <= alpha.min() <= alpha.max() <= 1
+        np.testing.assert_array_equal(alpha[:, :30], 0)
+        np.testing.assert_array_equal(alpha[:, -30:], 1)
+        rms[stage] = float(np.sqrt(np.mean((alpha - clean) ** 2)))
+    assert rms["clean-alpha"] < 0.4 * rms["skip"]
+
+
 def test_what_is_opaque_stays_opaque(tmp_path, weights):
     """Interpolated outlines of neighbours used to leave 0.99 where the frame itself covers all."""
 
