@@ -61,7 +61,7 @@ OUTLINE_NOISE_ABOVE = 0.02
 # sample Cycles makes the guides of all frames alike, their noise included.
 FEW_SAMPLES = 0.5
 # Noise of alpha that is filtered: 128 samples leave 0.03 in a pixel that is half transparent, and smooth shadows and
-# rims vary by less than 0.002 themselves. Of alpha without noise the filter changes 0.006 at a rim.
+# rims vary by less than 0.002 themselves. Alpha without noise is changed by 0.006 at a rim.
 ALPHA_NOISE_ABOVE = 0.01
 RADIUS = 2  # frames on each side of a window as it is planned for a whole shot
 

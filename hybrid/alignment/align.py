@@ -341,7 +341,7 @@ def _warp_first_pass(
             if flow.any():
                 warp(there, flow[rows], interpolation="bicubic", first_row=rows.start, out=warped[index])
                 bilinear, _ = warp(there, flow[rows], first_row=rows.start)
-                weights[index] = interpolation_weight(warped[index], bilinear, middle[rows], noise)
+                weights[index] = interpolation_weight(warped[index], bilinear, noise)
             else:
                 warped[index] = there[rows]
             fill_uncovered(warped[index], middle[rows], coverage[index])

@@ -82,7 +82,7 @@ def denoise_alpha(alpha: Array) -> Array:
     """Denoise alpha (H, W, 1) in [0, 1] as gray: with OIDN's network of albedo, or else the bundled network."""
     gray = np.repeat(np.clip(alpha, 0, 1), 3, axis=-1)
     clean = prefilter_guides({"albedo": gray})["albedo"] if has_oidn_networks() else denoise_bundled(gray)
-    return np.clip(clean.mean(axis=-1, keepdims=True), 0, 1)
+    return np.asarray(np.clip(clean.mean(axis=-1, keepdims=True), 0, 1), np.float32)
 
 
 def denoise_bundled(

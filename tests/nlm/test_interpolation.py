@@ -12,31 +12,27 @@ def images(*values: float) -> list[np.ndarray]:
 
 def test_it_is_its_formula() -> None:
     rng = np.random.default_rng(1)
-    warped, bilinear, centre = rng.gamma(1, 1, (3, 6, 7, 3)).astype(np.float32)
+    warped, bilinear = rng.gamma(1, 1, (2, 6, 7, 3)).astype(np.float32)
     variance = rng.gamma(1, 0.1, (6, 7)).astype(np.float32)
-    e, d = (((warped - other) ** 2).mean(axis=-1) for other in (bilinear, centre))
-    wanted = variance / (variance + 4 * e + np.maximum(d - 9 * variance, 0))
-    np.testing.assert_allclose(interpolation_weight(warped, bilinear, centre, variance), wanted, rtol=1e-5)
+    wanted = variance / (variance + ((warped - bilinear) ** 2).mean(axis=-1))
+    np.testing.assert_allclose(interpolation_weight(warped, bilinear, variance), wanted, rtol=1e-5)
 
 
-def test_equal_warps_count_in_full_with_and_without_noise() -> None:
-    warped, centre = images(1.0, 1.2)
-    # A difference of two deviations of a sample is the errors of both.
-    assert (interpolation_weight(warped, warped, centre, np.full((6, 7), 0.01, np.float32)) == 1).all()
-    assert (interpolation_weight(warped, warped, warped, np.zeros((6, 7), np.float32)) == 1).all()
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_equal_warps_count_in_full_with_and_without_noise(noise: float) -> None:
+    (warped,) = images(1.0)
+    assert (interpolation_weight(warped, warped, np.full((6, 7), noise, np.float32)) == 1).all()
 
 
-def test_a_rim_and_a_moved_highlight_beyond_the_noise_do_not_count() -> None:
-    warped, bilinear, centre = images(300.0, 200.0, 0.1)
-    variance = np.full((6, 7), 1.0, np.float32)
-    assert interpolation_weight(warped, bilinear, warped, variance).max() < 1e-3
-    assert interpolation_weight(warped, warped, centre, variance).max() < 1e-3
+def test_a_rim_of_a_lamp_does_not_count() -> None:
+    warped, bilinear = images(300.0, 200.0)
+    assert interpolation_weight(warped, bilinear, np.full((6, 7), 1.0, np.float32)).max() < 1e-3
 
 
 @pytest.mark.parametrize("scale", [2**-20, 2**20])
 def test_the_unit_of_light_does_not_matter(scale: float) -> None:
     rng = np.random.default_rng(2)
-    given = rng.gamma(1, 1, (3, 6, 7, 3)).astype(np.float32)
+    given = rng.gamma(1, 1, (2, 6, 7, 3)).astype(np.float32)
     variance = rng.gamma(1, 0.1, (6, 7)).astype(np.float32)
     plain = interpolation_weight(*given, variance)
     np.testing.assert_array_equal(interpolation_weight(*(scale * given), scale**2 * variance), plain)
