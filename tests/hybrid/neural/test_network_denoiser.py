@@ -151,7 +151,7 @@ def test_noise_of_alpha_is_filtered_in_space(tmp_path):
             open_shot(scene.write(tmp_path, edit=catch)), only(stages | {stage}), first_pass=Classical(DRAFT), radius=2
         )
         window = stream.align(scene.first)
-        alpha = open_network("fast")(window).aovs["alpha"]
+        alpha = open_network(shipped_weights("fast"))(window).aovs["alpha"]
         assert 0 <= alpha.min() <= alpha.max() <= 1
         np.testing.assert_array_equal(alpha[:, :30], 0)
         np.testing.assert_array_equal(alpha[:, -30:], 1)
