@@ -27,6 +27,7 @@ EXPECTED = {
     "measure_pair": FRAMES - 1,
     "measure_flows": FRAMES - 1,
     "fixed_noise": FRAMES - 1,  # for the orientations
+    "noise_correlation": FRAMES - 1,
     "first pass": FRAMES,
     "compose_flow": 2 * SECOND,
     "align": FRAMES,
@@ -64,6 +65,7 @@ def count(monkeypatch):
         "measure_pair",
         "measure_flows",
         "fixed_noise",
+        "noise_correlation",
     ):
         watch(stream, name)
     for name in ("align", "align_results", "find_bright", "restore_mean", "blend_samples"):

@@ -4,12 +4,14 @@ from functools import partial
 import numpy as np
 import pytest
 
-from hybrid.alignment.measure import NO_FADE
+from hybrid.alignment.measure import NO_FADE, FrameFacts
 from hybrid.files.frame import MappedShot
 from hybrid.files.shots import open_shot
 from hybrid.plan import DENOISED, NOISY, STAGES, Context, Rules, merge
 from hybrid.stream import FrameStream, plan_shot
 from tests.scenes import Scene, grained, only
+
+FACTS = FrameFacts(1, None, 0.1, None, 0, 0.0, None, 0.0, None)
 
 
 def decisions(folder):
@@ -424,3 +426,31 @@ def test_aovs_fade_by_factors_of_their_own(tmp_path):
     for name, layer in window.centre.aovs.items():
         means = [frame.aovs[name].mean() for frame in window.frames]
         np.testing.assert_allclose(means, layer.mean(), rtol=0.1, err_msg=name)
+
+
+NONE = (0.0, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "on", "words"),
+    [
+        ((0.4, 0.05, 0.01, 0.0), (0.35, 0.05, 0.0, 0.02), True, "correlates by 0.35"),
+        ((0.4, 0.05, 0.01, 0.0), NONE, False, "correlates by 0.00"),  # light that moves up or down
+        ((0.8, 0.5, 0.3, 0.2), (0.8, 0.5, 0.3, 0.2), False, "render with a narrower one"),
+    ],
+)
+def test_a_pixel_filter_is_undone_where_noise_is_shared_both_ways_and_not_far(x, y, on, words):
+    rules = Rules()
+    assert rules.whitens((x, y)) == on
+    facts = replace(FACTS, noise_correlation=(x, y))
+    decision = next(d for d in rules.decide([facts, FACTS], []).decisions if d.stage == "whiten")
+    assert decision.on == on
+    assert words in decision.reason
+    assert not Rules(off=frozenset({"whiten"})).whitens((x, y))
+
+
+def test_a_frame_whose_noise_cannot_be_compared_stays_as_it_is():
+    assert not Rules(on=frozenset({"whiten"})).whitens(None)
+    decision = next(d for d in Rules().decide([FACTS], []).decisions if d.stage == "whiten")
+    assert not decision.on
+    assert decision.figure is None

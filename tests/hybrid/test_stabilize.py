@@ -592,3 +592,27 @@ def test_negative_light_follows_the_edges_of_the_guides():
     made = _with_unfiltered(Denoised(np.full_like(albedo, 0.5)), prepared).color
     np.testing.assert_allclose(made[:, 17:20, 2], 0.5, atol=0.005)
     np.testing.assert_allclose(made[:, 20:23, 2], 0.4, atol=0.005)
+
+
+@pytest.mark.parametrize("scale", [1, 1024])
+def test_the_result_is_as_the_filter_of_the_renderer_makes_it(tmp_path, scale):
+    scene, taps = Scene(frames=5, height=96, width=128), np.array([1, 4, 1], np.float32) / 6
+
+    def spread(image):
+        return cv2.sepFilter2D(image, -1, taps, taps, borderType=cv2.BORDER_REFLECT_101)
+
+    def edit(_, layers):
+        for name in ("Combined", "Denoising Albedo", "Denoising Normal"):
+            layers[f"ViewLayer.{name}"] = spread(layers[f"ViewLayer.{name}"])
+
+    shot = open_shot(scene.write(tmp_path, scale=scale, edit=edit))
+    number = scene.first + 2
+    # The denoiser knows the truth without a filter.
+    rules = Rules(off=frozenset({"restore-mean", "blend-samples", "stabilize", "fireflies"}))
+    frames = FrameDenoiser(
+        FrameStream(shot, rules, first_pass=ESTIMATES), lambda aligned: Denoised(truth(scene, aligned.number, scale))
+    )
+    color = frames.make(number).denoised.color
+    expected = spread(truth(scene, number, scale))
+    unfiltered = np.abs(truth(scene, number, scale) - expected).mean()
+    assert np.abs(color - expected).mean() < 0.1 * unfiltered

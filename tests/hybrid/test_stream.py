@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from hybrid.files.shots import open_shot
-from hybrid.first_pass import PerFrame
+from hybrid.first_pass import PerFrame, find_first_pass
 from hybrid.plan import Context, Rules
 from hybrid.stream import FrameStream, plan_shot
 from tests.scenes import Scene, grained
@@ -257,3 +258,65 @@ def test_equal_frames_without_noise_are_no_frame_shown_twice(tmp_path, noise):
     assert frame.fireflies == (len(places) if noise else 0)
     if not noise:
         assert sorted(map(tuple, frame.highlights.pixels)) == places
+
+
+# Large enough for its noise to be measured.
+GRAINY = Scene(frames=6, height=96, width=128)
+TAPS = np.array([1, 5, 1], np.float32) / 7
+
+
+def spread(image):
+    """The image as a renderer's pixel filter of three pixels makes it."""
+    return cv2.sepFilter2D(image, -1, TAPS, TAPS, borderType=cv2.BORDER_REFLECT_101)
+
+
+def spread_layers(_, layers):
+    for name in ("Combined", "Denoising Albedo", "Denoising Normal"):
+        layers[f"ViewLayer.{name}"] = spread(layers[f"ViewLayer.{name}"])
+
+
+def test_the_filter_of_a_renderer_is_undone_before_anything_is_measured(tmp_path):
+    plain = load(open_shot(GRAINY.write(tmp_path / "plain")), [1003])[1003]
+    shot = open_shot(GRAINY.write(tmp_path / "spread", edit=spread_layers))
+    frame = load(shot, [1003])[1003]
+    assert plain.spread is None
+    assert frame.spread is not None
+    before = np.abs(shot.read(1003).color - plain.radiance).mean()
+    for name in ("radiance", "albedo"):
+        assert np.abs(getattr(frame, name) - getattr(plain, name)).mean() < 0.3 * before
+    assert frame.with_filter(frame.radiance) == pytest.approx(shot.read(1003).color, abs=0.02)
+    off = FrameStream(shot, Rules(off=frozenset({"whiten"}))).frame(1003)
+    np.testing.assert_allclose(off.radiance, shot.read(1003).color, rtol=1e-5)
+
+
+def test_the_filter_is_measured_from_the_frames_beside_a_frame_alone(tmp_path):
+    folder = GRAINY.write(tmp_path, edit=spread_layers)
+    whole = FrameStream(open_shot(folder), Rules())
+    for number in range(1001, 1005):
+        expected = whole.frame(number)
+    for number in (1001, 1002, 1006):
+        (folder / f"shot.{number}.exr").unlink()
+    part = FrameStream(open_shot(folder), Rules(off=frozenset({"fireflies"}))).frame(1004)
+    np.testing.assert_array_equal(part.spread.inverse, expected.spread.inverse)
+
+
+def test_what_another_denoiser_has_made_is_brought_into_the_light_without_the_filter(tmp_path):
+    folder = GRAINY.write(tmp_path / "noisy", edit=spread_layers)
+    finished = open_shot(GRAINY.write(tmp_path / "finished", clean=True, edit=spread_layers))
+    source = find_first_pass(str(tmp_path / "finished" / "shot.####.exr"), open_shot(folder)).first_pass
+    stream = FrameStream(open_shot(folder), Rules(), source)
+    frame, picture = stream.frame(1003), stream.denoised(1003)
+    np.testing.assert_array_equal(picture, np.maximum(frame.spread.undo(finished.read(1003).color), 0))
+
+
+def test_frames_that_repeat_are_found_where_their_filter_is_undone(tmp_path):
+    """The filters of two frames are measured from other pairs, so that equal samples differ without them."""
+    still = replace(GRAINY, step=(0, 0), frames=4)
+
+    def repeat(index, layers):
+        layers |= still.noisy(index - (index == 3))
+        spread_layers(index, layers)
+
+    plan = plan_shot(open_shot(still.write(tmp_path, edit=repeat)))
+    assert "whiten" in plan.stages
+    assert plan.repeats == ((1003, 1004),)

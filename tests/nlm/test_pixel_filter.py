@@ -1,0 +1,92 @@
+import cv2
+import numpy as np
+import pytest
+
+from nlm.pixel_filter import find_filter, measure_correlation
+
+SHAPE = 192, 256
+NOTHING = np.zeros(SHAPE, np.float32)
+
+
+def white(seed: int) -> np.ndarray:
+    """Noise with the long tail of few samples."""
+    return (np.random.default_rng(seed).gamma(0.3, 1, SHAPE) - 0.3).astype(np.float32)
+
+
+def spread(noise: np.ndarray, r: float) -> np.ndarray:
+    taps = np.array([r, 1, r], np.float32) / (1 + 2 * r)
+    return cv2.sepFilter2D(noise, -1, taps, taps, borderType=cv2.BORDER_REFLECT_101)
+
+
+def measured(noise: np.ndarray, trusted: np.ndarray | None = None) -> np.ndarray:
+    found = measure_correlation(noise, np.ones(SHAPE, bool) if trusted is None else trusted, NOTHING)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("r", [0, 0.1, 0.2, 0.3, 0.45])
+def test_the_correlation_is_that_of_the_filter(r):
+    taps = np.array([r, 1, r])
+    lags = np.convolve(taps, taps)[3:] / np.square(taps).sum()
+    expected = [*lags, 0, 0]
+    np.testing.assert_allclose(measured(spread(white(1), r)), [expected, expected], atol=0.04)
+
+
+def test_each_direction_is_measured_by_itself():
+    taps = np.array([0.2, 1, 0.2], np.float32)
+    across = cv2.sepFilter2D(white(1), -1, taps, np.ones(1, np.float32))
+    (x, *_), (y, *_) = measured(across)
+    assert x == pytest.approx(0.37, abs=0.03)
+    assert y == pytest.approx(0, abs=0.03)
+
+
+def test_light_that_moves_is_no_correlation():
+    noise = white(1)
+    noise[:, :80] += 3 * np.sin(np.arange(80, dtype=np.float32) / 2)  # a third of the picture
+    assert abs(measured(noise)[:, 0]).max() < 0.06
+
+
+def test_pixels_that_are_not_trusted_and_bright_samples_decide_nothing():
+    noise = spread(white(1), 0.2)
+    expected = measured(noise)
+    noise[60, 70] = 1e6
+    assert measured(noise) == pytest.approx(expected, abs=0.03)
+    noise[:, :80], trusted = 1e3, np.ones(SHAPE, bool)
+    trusted[:, :84] = False
+    assert measured(noise, trusted) == pytest.approx(expected, abs=0.05)
+
+
+def test_the_unit_of_light_does_not_matter():
+    noise = spread(white(1), 0.2)
+    np.testing.assert_array_equal(measured(1024 * noise), measured(noise))
+
+
+def test_too_little_noise_gives_no_correlation():
+    everywhere = np.ones(SHAPE, bool)
+    assert measure_correlation(white(1), everywhere, np.full(SHAPE, 10, np.float32)) is None
+    assert measure_correlation(NOTHING, everywhere, NOTHING) is None
+    assert measure_correlation(white(1), np.zeros(SHAPE, bool), NOTHING) is None
+    small = np.s_[:16, :64]  # four tiles
+    assert measure_correlation(white(1)[small], everywhere[small], NOTHING[small]) is None
+
+
+@pytest.mark.parametrize("r", [0.1, 0.2, 0.3])
+def test_a_filter_undone_leaves_white_noise_and_applied_again_the_image(r):
+    image = spread(white(1), r)[..., None]
+    found = find_filter(measured(image[..., 0]))
+    undone = found.undo(image)
+    assert abs(measured(undone[..., 0])).max() < 0.05
+    assert undone.var() == pytest.approx(found.gain * image.var(), rel=0.1)
+    np.testing.assert_allclose(found.apply(undone), image, atol=2e-3 * image.std())
+
+
+def test_a_constant_stays():
+    found = find_filter(np.array([[0.4, 0.05, 0, 0], [0.3, 0.02, 0, 0]]))
+    flat = np.full((20, 30, 3), 5, np.float32)
+    np.testing.assert_allclose(found.undo(flat), flat, rtol=1e-5)
+    np.testing.assert_allclose(found.apply(flat), flat, rtol=1e-5)
+
+
+def test_what_a_wide_filter_leaves_of_no_frequency_is_not_amplified():
+    found = find_filter(np.array([[0.8, 0.4, 0.1, 0], [0.8, 0.4, 0.1, 0]]))
+    assert np.abs(np.outer(*found.inverse)).sum() < 1000  # without the least power millions
