@@ -1,0 +1,133 @@
+"""Accuracy and stability of presets and of OIDN on shots at several numbers of samples, as JSON, table and chart.
+
+    python benchmarks/ladder.py FOLDER [FOLDER ...] -o ladder.json [--methods oidn-best balanced] [--chart ladder.png]
+
+A folder holds LEVEL.####.exr, or several levels of a shot, and reference_a.####.exr and reference_b.####.exr, two
+independent renders of the frames to judge, as `ravg simulate --levels s008=8,s032=32 --second-reference` writes them.
+Frames without a reference serve as neighbours. Figures are PSNR and temporal PSNR (at most 65 dB, where the noise of
+references begins) on x / (1 + x), means over the frames. What is in the JSON file already is not run again.
+"""
+
+import argparse
+import json
+import re
+import sys
+import tempfile
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from hybrid import denoise_shot, open_shot
+from hybrid.comparison.evaluation import motion_between
+from hybrid.comparison.metrics import psnr, temporal_psnr
+from hybrid.files.frame import Array
+from hybrid.files.shots import Shot
+from hybrid.oidn import denoise_oidn
+
+OIDN = {"oidn-high": None, "oidn-best": "high"}
+METHODS = ("noisy", *OIDN, "fast", "balanced", "quality")
+MOST = 65.0
+
+
+def denoise(shot: Shot, method: str) -> list[Array]:
+    """The frames of a shot by a method."""
+    frames = [shot.read(number) for number in shot.numbers]
+    if method == "noisy":
+        return [frame.color for frame in frames]
+    if method in OIDN:
+        return [denoise_oidn(f.color, f.albedo, f.normal, prefilter=OIDN[method]) for f in frames]  # type: ignore
+    with tempfile.TemporaryDirectory() as folder:
+        pattern = f"{folder}/frame.####.exr"
+        list(denoise_shot(shot, pattern, preset=method))
+        made = open_shot(pattern)
+        return [made.read(number).color for number in shot.numbers]
+
+
+def levels(folder: Path) -> Iterator[str]:
+    """Names of the levels of a shot."""
+    found = {re.sub(r"\.-?\d+\.exr$", "", path.name) for path in folder.glob("*.exr")}
+    yield from sorted(name for name in found if not name.startswith("reference"))
+
+
+def judge(folder: Path, methods: list[str], results: dict[str, list[float]], out: Path) -> None:
+    """Add the figures of a shot to the results, and write these after each method."""
+    halves = [open_shot(f"{folder}/reference_{half}.####.exr") for half in "ab"]
+    numbers = halves[0].numbers
+    truth = [(halves[0].read(number).color, halves[1].read(number).color) for number in numbers]
+    for level in levels(folder):
+        shot = open_shot(f"{folder}/{level}.####.exr", frames=f"{numbers[0]}-{numbers[-1]}")
+        missing = [method for method in methods if f"{folder.name} {level} {method}" not in results]
+        frames = [shot.read(number) for number in shot.numbers]
+        motion = [motion_between(*pair) for pair in pairwise(frames)]
+        flows, valid = zip(*motion, strict=True) if motion and None not in motion else ((), ())
+        for method in missing:
+            images = denoise(shot, method)
+            figures = [float(np.mean([psnr(x, r) for x, r in zip(images, truth, strict=True)]))]
+            if flows:
+                figures.append(float(np.mean(np.minimum(temporal_psnr(images, truth, flows, valid), MOST))))
+            results[f"{folder.name} {level} {method}"] = [round(figure, 3) for figure in figures]
+            out.write_text(json.dumps(results, indent=0), encoding="utf-8")
+            print(folder.name, level, method, *results[f"{folder.name} {level} {method}"], flush=True)
+
+
+def table(results: dict[str, list[float]]) -> str:
+    """Means of each level and method, in Markdown."""
+    rows = [key.split(" ") for key in results]
+    names = list(dict.fromkeys(level for _, level, _ in rows))
+    lines = ["| method | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
+    for method in dict.fromkeys(method for *_, method in rows):
+        cells = []
+        for level in names:
+            figures = [v for key, v in results.items() if key.endswith(f" {level} {method}")]
+            cells.append(" / ".join(f"{np.mean(column):.2f}" for column in zip(*figures, strict=True)))
+        lines.append(f"| {method} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def draw(results: dict[str, list[float]], path: Path) -> None:
+    """Draw both figures against the samples that names of levels end with, such as s032."""
+    import matplotlib
+
+    matplotlib.use("svg")
+    from matplotlib import pyplot
+
+    _, axes = pyplot.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
+    for axis, index, title in zip(axes, (0, 1), ("PSNR, dB", "temporal PSNR, dB"), strict=True):
+        for method in dict.fromkeys(key.split(" ")[2] for key in results):
+            points: dict[int, list[float]] = {}
+            for key, figures in results.items():
+                _, level, name = key.split(" ")
+                if name == method:
+                    points.setdefault(int(level.lstrip("s")), []).append(figures[index])
+            style = ":" if method == "noisy" else "--" if method in OIDN else "-"
+            axis.plot(list(points), [np.mean(values) for values in points.values()], style, marker=".", label=method)
+        axis.set(xscale="log", xlabel="samples per pixel", title=title)
+        axis.set_xticks(sorted(points), [str(count) for count in sorted(points)], minor=False)
+        axis.minorticks_off()
+        axis.grid(alpha=0.3)
+    axes[0].legend(frameon=False, fontsize=8)
+    pyplot.savefig(path, dpi=110)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("folders", nargs="+", type=Path)
+    parser.add_argument("-o", "--output", type=Path, required=True, help="JSON, continued if it is there")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
+    parser.add_argument("--chart", type=Path)
+    options = parser.parse_args()
+    results = json.loads(options.output.read_text(encoding="utf-8")) if options.output.exists() else {}
+    for folder in options.folders:
+        judge(folder, options.methods, results, options.output)
+    print(table(results))
+    if options.chart:
+        draw(results, options.chart)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
