@@ -1,4 +1,4 @@
-"""What denoising will take, told before it starts: from the time that earlier runs took on this machine."""
+"""The time that denoising will take, stated before it starts: by the rate of earlier runs on this machine."""
 
 import json
 import os

@@ -15,7 +15,7 @@ from hybrid.commands.options import command
 from hybrid.files.replace import replace_file
 
 ROOT = Path(__file__).parents[2]
-FILES = ("LICENSE", "NOTICE", "README.md", "pyproject.toml", "setup.cfg")  # what the wheel is built from, but packages
+FILES = ("LICENSE", "NOTICE", "README.md", "pyproject.toml", "setup.cfg")  # for the wheel, beside its packages
 
 
 @command("blender-extension")
