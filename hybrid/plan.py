@@ -41,8 +41,8 @@ NEURAL_STAGES = frozenset({"clean-guides", "stabilize", "alpha", "skip"})  # sta
 # Correlation of the noise of neighbouring pixels, along x or y, whichever is less: as changes of a clean picture add to
 # it, up to 0.1 is measured for independent noise, on forty shots; the narrowest tent leaves 0.17.
 WHITEN_ABOVE = 0.13
-# The mean of that of pixels three and four apart: 0.02 by the filters of renderers, 0.05 by wider ones that can be undone
-# in part, 0.07 of these in frames of 80 pixels; errors of denoised pictures have 0.12 and more.
+# The mean of that of pixels three and four apart: 0.02 by the filters of renderers, 0.05 by wider ones that can be
+# undone in part, 0.07 in frames of 80 pixels; errors of denoised pictures have 0.12 and more.
 WHITEN_BELOW = 0.09
 STILL = 0.05  # motion below a twentieth of a pixel blurs a bilinear sample by less than 1 % of its contrast
 # Share of pixels, in areas of 9×9, whose brightness the vectors do not explain. Refinement is worth its time for

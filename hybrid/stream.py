@@ -299,12 +299,12 @@ class FrameStream:
         return self._cached("raw", (number,), self._read)
 
     def _correlation(self, number: int) -> Correlation | None:
-        """The correlation of a frame's noise, from its difference to the frame before, else after; None if unknown."""
-        if "whiten" not in self.rules.allowed:
+        """The correlation of a frame's noise by its difference to the frame before; of the first, to the one after."""
+        before, _, after = self.around(number, 1)
+        pair = (before, number) if self.shot.has(before) else (number, after)
+        if "whiten" not in self.rules.allowed or not all(map(self.shot.has, pair)):
             return None
-        pairs = [pair for pair in pairwise(self.around(number, 1)) if all(map(self.shot.has, pair))]
-        found = (self._cached("correlation", pair, self._measure_correlation) for pair in pairs)
-        return next((correlation for correlation in found if correlation is not None), None)
+        return self._cached("correlation", pair, self._measure_correlation)
 
     def _measure_correlation(self, a: int, b: int) -> Correlation | None:
         try:
