@@ -169,6 +169,7 @@ class _ShotDenoiser:
         self.views, self.settings, self.timings = views, settings, timings
         self.shot = views[0].shot
         self.support = temporal_support(views[0].first_pass, radius, rules)
+        self.ahead = self.support - REACH - ("whiten" in rules.allowed)
         self.sources = sources_of(views, radius, rules, settings.sources)
         self.readers = [Prefetcher(view.shot, thread, timings) for view in views]
         self.denoisers, keeper = [], Keeper(in_files=settings.in_files, trims=settings.trims)
@@ -226,8 +227,9 @@ class _ShotDenoiser:
 
     def _expect(self, number: int) -> None:
         """Read ahead the frames that the result of a frame needs."""
-        # The outermost are read only where something shines in the one beside them, or by a later window.
-        near = self.shot.neighbours(number, self.support - REACH) if self.settings.background else ()
+        # The outermost are read only where something shines in the one beside them, or by a later window, and the one
+        # whose noise is compared has been read before.
+        near = self.shot.neighbours(number, self.ahead) if self.settings.background else ()
         for reader in self.readers:
             reader.expect(near)
 

@@ -42,9 +42,9 @@ NEURAL_STAGES = frozenset({"clean-guides", "stabilize", "alpha", "clean-alpha", 
 # Correlation of the noise of neighbouring pixels, along x or y, whichever is less: as changes of a clean picture add to
 # it, up to 0.1 is measured for independent noise, on forty shots; the narrowest tent leaves 0.17.
 WHITEN_ABOVE = 0.13
-# The greatest of pixels three or four apart: 0.02 by the filters of renderers, 0.06 by wider ones that can be undone in
-# part; errors of denoised pictures have 0.12 and more.
-WHITEN_BELOW = 0.1
+# The mean of that of pixels three and four apart: 0.02 by the filters of renderers, 0.05 by wider ones that can be
+# undone in part, 0.07 in frames of 80 pixels; errors of denoised pictures have 0.12 and more.
+WHITEN_BELOW = 0.09
 STILL = 0.05  # motion below a twentieth of a pixel blurs a bilinear sample by less than 1 % of its contrast
 # Share of pixels, in areas of 9×9, whose brightness the vectors do not explain. Refinement is worth its time for
 # reflections and shadows of some size; the gate is cheap and already pays for a small highlight.
@@ -251,7 +251,7 @@ def _switch(stage: str, on: bool, reason: str) -> Decision:
 
 
 def _decide_whiten(correlations: Sequence[Correlation | None]) -> Decision:
-    known = [(min(lags[0] for lags in c), max(max(lags[2:]) for lags in c)) for c in correlations if c is not None]
+    known = [(min(lags[0] for lags in c), float(np.mean([lags[2:] for lags in c]))) for c in correlations if c]
     if not known:
         return Decision("whiten", False, None, WHITEN_ABOVE, "no two neighbouring frames whose noise can be compared")
     near, far = max(known, key=lambda figures: (figures[1] < WHITEN_BELOW, figures[0]))

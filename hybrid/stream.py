@@ -101,7 +101,7 @@ class FrameStream:
         kept = {*numbers}
         loaded = [frames[0] for kind, frames in self._cache if kind == "frame" and frames[0] in kept]
         first = max(loaded, default=min(kept)) - (REACH - 1) * self.shot.step
-        last = max(kept) + (REACH + 1) * self.shot.step
+        last = max(kept) + REACH * self.shot.step
 
         def is_kept(kind: str, frames: tuple[int, ...]) -> bool:
             if kind == "raw":  # the noise of a frame is compared with that of the next one, and then no more
@@ -317,16 +317,18 @@ class FrameStream:
         return self._cached("raw", (number,), self._read)
 
     def _correlation(self, number: int) -> Correlation | None:
-        """The correlation of a frame's noise, the mean over its pairs with the frames beside it; None if unknown."""
-        if "whiten" not in self.rules.allowed:
+        """The correlation of a frame's noise by its difference to the frame before; of the first, to the one after."""
+        before, _, after = self.around(number, 1)
+        pair = (before, number) if self.shot.has(before) else (number, after)
+        if "whiten" not in self.rules.allowed or not all(map(self.shot.has, pair)):
             return None
-        pairs = [pair for pair in pairwise(self.around(number, 1)) if all(map(self.shot.has, pair))]
-        found = [self._cached("correlation", pair, self._measure_correlation) for pair in pairs]
-        known = [correlation for correlation in found if correlation is not None]
-        return cast(Correlation, tuple(map(tuple, np.mean(known, axis=0).tolist()))) if known else None
+        return self._cached("correlation", pair, self._measure_correlation)
 
     def _measure_correlation(self, a: int, b: int) -> Correlation | None:
-        first, second = self._raw(a), self._raw(b)
+        try:
+            first, second = self._raw(a), self._raw(b)
+        except (ValueError, OSError):  # of the other frame, whose own turn it is to fail
+            return None
         with self.timings.stage("plan"):
             return noise_correlation(first, second)
 

@@ -311,11 +311,14 @@ def noise_correlation(here: PreparedFrame, there: PreparedFrame) -> Correlation 
     """Correlation of the noise of two neighbours (`nlm.pixel_filter.measure_correlation`); None where it is unknown.
 
     Frames are compared along whole pixels of the vectors, in the middle of the picture, where their guides agree.
+    Without vectors and albedo nothing tells texture that moves from noise.
     """
     block = _middle(here.irradiance.shape[:2])
     height, width = here.valid.shape
     rows, columns = np.arange(height)[block[0], None], np.arange(width)[None, block[1]]
     vectors = rendered_flow(here, there)
+    if vectors is None and (here.albedo is None or there.albedo is None):
+        return None
     trusted = here.valid[block].copy()
     if vectors is not None:
         moved = np.rint(np.where(vectors[1][block][..., None], vectors[0][block], np.float32(-1e6))).astype(np.intp)

@@ -615,4 +615,4 @@ def test_the_result_is_as_the_filter_of_the_renderer_makes_it(tmp_path, scale):
     color = frames.make(number).denoised.color
     expected = spread(truth(scene, number, scale))
     unfiltered = np.abs(truth(scene, number, scale) - expected).mean()
-    assert np.abs(color - expected).mean() < 0.1 * unfiltered
+    assert np.abs(color - expected).mean() < 0.3 * unfiltered

@@ -300,6 +300,11 @@ def test_the_filter_is_measured_from_the_frames_beside_a_frame_alone(tmp_path):
     np.testing.assert_array_equal(part.spread.inverse, expected.spread.inverse)
 
 
+def test_texture_that_moves_is_no_noise(tmp_path):
+    folder = GRAINY.write(tmp_path, without={"Vector", "Denoising Albedo", "Denoising Normal"})
+    assert FrameStream(open_shot(folder), Rules(on=frozenset({"whiten"}))).frame(1003).spread is None
+
+
 def test_what_another_denoiser_has_made_is_brought_into_the_light_without_the_filter(tmp_path):
     folder = GRAINY.write(tmp_path / "noisy", edit=spread_layers)
     finished = open_shot(GRAINY.write(tmp_path / "finished", clean=True, edit=spread_layers))
