@@ -11,7 +11,6 @@ torch = pytest.importorskip("torch")
 
 from hybrid.alignment.transfer import measure_exposure  # noqa: E402
 from hybrid.comparison import metrics  # noqa: E402
-from hybrid.first_pass import NETWORKS  # noqa: E402
 from network import robust_unet  # noqa: E402
 from network.checkpoint import load_model, shipped_weights  # noqa: E402
 from network.paper import models as paper  # noqa: E402
