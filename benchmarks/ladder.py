@@ -5,7 +5,7 @@
 A folder holds LEVEL.####.exr, or several levels of a shot, and reference_a.####.exr and reference_b.####.exr, two
 independent renders of the frames to judge, as `ravg simulate --levels s008=8,s032=32 --second-reference` writes them.
 Frames without a reference serve as neighbours. Figures are PSNR and temporal PSNR (at most 65 dB, where the noise of
-references begins) on x / (1 + x), means over the frames. What is in the JSON file already is not run again.
+references begins) on x / (1 + x), means over the frames. Figures that are in the JSON file already are kept.
 """
 
 import argparse
