@@ -90,12 +90,12 @@ def render_again(path, note, seconds=None):
 @pytest.mark.parametrize(
     ("what", "again"),
     [
-        ("an older frame", range(1001, 1009)),
-        ("a frame of the same size and time", range(1001, 1009)),
-        ("a frame that comes late", range(1006, 1011)),
-        ("a frame that is gone", range(1006, 1010)),
-        ("an estimate made again", range(1001, 1009)),
-        ("an older estimate", range(1001, 1009)),
+        ("an older frame", range(1001, 1010)),
+        ("a frame of the same size and time", range(1001, 1010)),
+        ("a frame that comes late", range(1005, 1011)),
+        ("a frame that is gone", range(1005, 1010)),
+        ("an estimate made again", range(1001, 1010)),
+        ("an older estimate", range(1001, 1010)),
         ("other vectors", range(1001, 1011)),
         ("another version", range(1001, 1011)),
         ("the project unpacked elsewhere", ()),
