@@ -50,15 +50,11 @@ def test_is_the_picture_of_oidn(frame, mode, guides) -> None:
     assert psnr(result, expected) > 52
 
 
-def test_what_comes_with_ravg_stands_for_each_quality_of_oidn(frame) -> None:
-    """Its weights begin as OIDN's: of another size the picture is another one."""
-    found, expected = (
-        {quality: run(frame.color, frame.albedo, frame.normal, quality=quality) for quality in ("fast", "high")}
-        for run in (denoise_bundled, denoise_unet)
-    )
-    for quality, other in (("fast", "high"), ("high", "fast")):
-        assert psnr(found[quality], expected[quality]) > 55
-        assert psnr(found[quality], expected[other]) < 50
+def test_what_comes_with_ravg_is_oidns_base_network_for_each_quality(frame) -> None:
+    """The image of another network is 35 to 45 dB away."""
+    expected = denoise_unet(frame.color, frame.albedo, frame.normal, quality="high")
+    for quality in ("fast", "high"):
+        assert psnr(denoise_bundled(frame.color, frame.albedo, frame.normal, quality=quality), expected) > 55
 
 
 def test_clean_guides_are_declared_so(frame) -> None:
