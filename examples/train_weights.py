@@ -51,7 +51,6 @@ def training_shots(scenes: Sequence[str]) -> Iterator[TrainingShot]:
 CLIPS = "--reference --tile 0 --first-pass oidn-fast --window 7 --teacher quality"
 #: Settings of each preset: the larger a network, the longer a step takes.
 SCHEDULES = {
-    "fast": ["--window", 5, "--batch", 8, "--rate", 3e-5, "--steps", 2400],
     "balanced": ["--window", 5, "--batch", 8, "--rate", 3e-5, "--steps", 2400],
     "quality": ["--window", 7, "--batch", 4, "--rate", 2e-5, "--steps", 2400],
 }
