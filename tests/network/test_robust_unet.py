@@ -129,5 +129,5 @@ def test_windows_and_configurations_that_do_not_fit_are_refused() -> None:
         small(frames=3)(make_window(5))
     with pytest.raises(ValueError, match="frames: expected an odd number"):
         RobustUNetConfig(4)
-    with pytest.raises(ValueError, match="size: expected one of small, base, large"):
+    with pytest.raises(ValueError, match="size: expected one of none, small, base, large"):
         RobustUNetConfig(size="huge")
