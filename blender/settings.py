@@ -8,9 +8,9 @@ import bpy
 from . import command, install
 
 PRESETS = (
-    ("fast", "Fast", "Network after OIDN in its fast mode"),
-    ("balanced", "Balanced", "Network after OIDN"),
-    ("quality", "Quality", "Network after OIDN with denoised guides"),
+    ("fast", "Fast", "Average of denoised frames"),
+    ("balanced", "Balanced", "The average, and a network on the samples of all frames"),
+    ("quality", "Quality", "The same with a large network and denoised guides"),
     ("average", "Without Network", "Temporal average of frames denoised by OIDN: needs no torch"),
 )
 
