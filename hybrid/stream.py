@@ -424,7 +424,10 @@ class FrameStream:
         return fade if min(fade) > FAINT and max(fade) < 1 / FAINT else NO_FADE
 
     def _measure_flows(self, earlier: int, later: int) -> PairFlows:
-        plan, facts = self.plan([earlier, later]), self._pair_facts(earlier, later)
+        # Windows of noisy frames, of which some first passes are made, have the same flows.
+        denoised = self.source is not None and not self.source.from_noisy
+        plan = self.plan([earlier, later], self.context(denoised, self.radius))
+        facts = self._pair_facts(earlier, later)
         if facts.cut:
             return PairFlows(None, None)
         stages = plan.stages - {"warp"} if facts.repeated else plan.stages

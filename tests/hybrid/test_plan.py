@@ -7,6 +7,7 @@ import pytest
 from hybrid.alignment.measure import NO_FADE, FrameFacts
 from hybrid.files.frame import MappedShot
 from hybrid.files.shots import open_shot
+from hybrid.first_pass import PerFrame
 from hybrid.plan import DENOISED, NOISY, STAGES, Context, Rules, merge
 from hybrid.stream import FrameStream, plan_shot
 from tests.scenes import Scene, grained, only
@@ -454,3 +455,19 @@ def test_a_frame_whose_noise_cannot_be_compared_stays_as_it_is():
     decision = next(d for d in Rules().decide([FACTS], []).decisions if d.stage == "whiten")
     assert not decision.on
     assert decision.figure is None
+
+
+@pytest.mark.parametrize(("forced", "runs"), [(False, False), (True, True)])
+def test_flows_between_denoised_frames_are_the_renderers_unless_refinement_is_forced(tmp_path, forced, runs):
+    """The plan of a window said so, and each pair of frames was refined nevertheless."""
+    ran = []
+
+    def refine(guides, flow):
+        ran.append(flow.shape)
+        return flow
+
+    rules = Rules(on=frozenset({"refine"} if forced else ()))
+    shot = open_shot(Scene().write(tmp_path, edit=reflect))
+    stream = FrameStream(shot, rules, PerFrame(lambda frame: frame.color), refine=refine)
+    stream.align(shot.numbers[1])
+    assert bool(ran) == runs
