@@ -323,7 +323,7 @@ def test_it_starts_when_blender_has_rendered(blender, shot):
         time.sleep(pause)
     answer = [waiting, started, job.run.code, len(bpy.app.handlers.render_complete) - count]
     """
-    assert blender.run(code, blend=shot) == [["Rendering", False, True], True, 0, 0]
+    assert blender.run(code, blend=shot) == [["Rendering: 0 of 0 frames", False, True], True, 0, 0]
 
 
 @needs_ravg
@@ -942,7 +942,7 @@ def install(**how):
     except RuntimeError as error:
         return str(error).strip()
 def there():
-    return sorted(path.name for path in settings.home().iterdir())
+    return sorted(path.name for path in settings.home().iterdir() if path.name != "rates.json")
 def ran():
     return subprocess.run([settings.executable(), "--version"], capture_output=True, text=True).stdout.strip()
 import os, subprocess
