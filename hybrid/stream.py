@@ -426,7 +426,7 @@ class FrameStream:
     def _measure_flows(self, earlier: int, later: int) -> PairFlows:
         # Windows of noisy frames, of which some first passes are made, have the same flows.
         denoised = self.source is not None and not self.source.from_noisy
-        plan = self.plan([earlier, later], self.context(denoised, self.radius))
+        plan = self.plan([earlier, later], DENOISED if denoised else NOISY)
         facts = self._pair_facts(earlier, later)
         if facts.cut:
             return PairFlows(None, None)
