@@ -209,7 +209,7 @@ def align_results(
             here = Trust(known.coverage[padded], known.confidence[padded])
             _set_trust(confidence, coverage, window, index, here, padded)
     assert window.first_pass is not None
-    results, _ = _warp_first_pass(window, window.first_pass, coverage, padded, timings)
+    results, _ = _warp_first_pass(window, window.first_pass, coverage, padded, timings, weigh=False)
     with timings.stage("stabilize"):
         divisor = None if centre.albedo is None or not centre.demodulated else centre.albedo[padded]
         light = results if divisor is None else demodulate(results, divisor)
@@ -316,18 +316,24 @@ def _set_trust(confidence: Array, coverage: Array, window: Window, index: int, t
 
 
 def _warp_first_pass(
-    window: Window, first_pass: Sequence[Array | None], coverage: Array, rows: slice, timings: Timings
+    window: Window,
+    first_pass: Sequence[Array | None],
+    coverage: Array,
+    rows: slice,
+    timings: Timings,
+    *,
+    weigh: bool = True,
 ) -> tuple[Array, list[Array | None]]:
     """Warp first passes to these rows, (T, h, W, 3); the centre's, with coverage 0, where a neighbour has none.
 
-    With the weight of each by its interpolation, (h, W); None: 1.
+    With the weight of each by its interpolation, (h, W), if `weigh`; None: 1.
     """
     middle = first_pass[len(first_pass) // 2]
     if middle is None:
         raise ValueError(f"frame {window.centre.number} has no first pass, expected one like its neighbours")
     warped = np.empty((len(first_pass), *middle[rows].shape), np.float32)
     weights: list[Array | None] = [None] * len(first_pass)
-    noise = measure_noise(window.centre.radiance[rows], middle[rows])
+    noise = measure_noise(window.centre.radiance[rows], middle[rows]) if weigh else None
     for index, (there, link) in enumerate(zip(first_pass, window.links, strict=True)):
         if link is None or there is None:
             warped[index] = middle[rows]
@@ -340,8 +346,9 @@ def _warp_first_pass(
             flow = link.forward.vectors
             if flow.any():
                 warp(there, flow[rows], interpolation="bicubic", first_row=rows.start, out=warped[index])
-                bilinear, _ = warp(there, flow[rows], first_row=rows.start)
-                weights[index] = interpolation_weight(warped[index], bilinear, noise)
+                if noise is not None:
+                    bilinear, _ = warp(there, flow[rows], first_row=rows.start)
+                    weights[index] = interpolation_weight(warped[index], bilinear, noise)
             else:
                 warped[index] = there[rows]
             fill_uncovered(warped[index], middle[rows], coverage[index])
