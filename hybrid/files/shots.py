@@ -259,7 +259,7 @@ def open_shot(
     profile: Profile | None = None,
     motion: str | None = None,
     aovs: Sequence[str] = (),
-    keep: int = 2,
+    keep: int = 0,
     max_pixels: int = MAX_PIXELS,
 ) -> Shot:
     """Find the files of a shot. No pixels are read.
@@ -278,7 +278,7 @@ def open_shot(
         "none" ignores them.
     aovs : sequence of str
         Names of layers to read into `Frame.aovs`.
-    keep : int, how many frames to hold in memory
+    keep : int, how many frames `Shot.read` holds in memory, to return them again
     max_pixels : int
         Of the largest frame, see `hybrid.files.exr.read_exr`.
 
