@@ -62,7 +62,6 @@ class ShotInput(ReadOptions):
             profile=parse_input(self.profile, self.motion),
             motion=self.motion,
             aovs=tuple(self.aovs),
-            keep=0,  # the stream of windows holds what is made of a frame
             max_pixels=MAX_PIXELS if self.max_pixels is None else self.max_pixels,
         )
         for warning in opened.warnings:

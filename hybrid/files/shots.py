@@ -368,14 +368,14 @@ def open_matching_sequence(spec: str | Path, shot: Shot, *, frames: str | None =
     The shot's color is chosen if the other's layers leave a choice, as between two view layers. Errors are those of
     `open_shot`.
     """
-    opened = open_shot(spec, frames=frames, keep=0)
+    opened = open_shot(spec, frames=frames)
     with suppress(ExrError):
         opened.layers(opened.numbers[0])
         return opened
     target = shot.layers(shot.numbers[0]).target
     with suppress(ExrError):
         opened.header(opened.numbers[0]).again(target)
-        return open_shot(spec, frames=frames, layers={"color": target}, keep=0)
+        return open_shot(spec, frames=frames, layers={"color": target})
     return opened
 
 

@@ -345,7 +345,7 @@ def test_no_frame_is_read_twice_and_a_second_pair_only_where_one_leaves_a_questi
     for spec, motion, count in ((bundled, None, 2), (bundled, "auto", 2), (wrong, None, 4)):
         numbers: list[int] = []
         monkeypatch.setattr(Shot, "read", lambda shot, number, seen=numbers: seen.append(number) or read(shot, number))
-        validate_layers(open_shot(spec, keep=0, motion=motion))
+        validate_layers(open_shot(spec, motion=motion))
         assert len(numbers) == len(set(numbers)) == count, (spec, motion)
 
 
