@@ -309,7 +309,7 @@ def test_motion_that_is_ignored_stays_ignored_after_validation(tmp_path):
 
 
 def test_a_shot_with_neighbours_holds_the_frames_that_were_read(tmp_path):
-    shot = open_shot(save_frames(tmp_path, [1, 2, 3]), frames="2")
+    shot = open_shot(save_frames(tmp_path, [1, 2, 3]), frames="2", keep=1)
     frame = shot.read(2)
     wider = shot.with_neighbours(1)
     assert wider.numbers == (1, 2, 3)
