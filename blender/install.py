@@ -18,7 +18,7 @@ _NO_NETWORK = re.compile(
 
 # The package index has torch with CUDA alone for Linux; PyTorch's own index has it for CPUs.
 _TORCH_FOR_CPUS = "https://download.pytorch.org/whl/cpu"
-# GB to download and on disk, measured on Linux.
+# GB to download and on disk, measured on Linux, except the 3 GB for GPUs, which are an estimate.
 _FOR_CPUS, _FOR_GPUS = (0.4, 1.8), (3.0, 6.3)
 
 
