@@ -16,7 +16,10 @@ import pytest
 from hybrid.cli import COMMANDS, LazyCommand, main
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")),
+    *sorted((ROOT / "docs").rglob("*.md")),
+]
 IDS = [str(page.relative_to(ROOT)) for page in PAGES]
 # A marker, which no reader sees, before a block of commands.
 BLOCK = re.compile(r"(?:<!-- (?P<marker>[^>]*) -->\n)?```(?P<kind>\w*)\n(?P<text>.*?)\n```", re.DOTALL)
@@ -33,7 +36,17 @@ FOREIGN = {
         "--addons",
         "--python",
     ),
-    *("--python-exit-code", "--chnames", "--chappend", "--no-deps", "--host", "--port", "--nworkers", "--nthreads"),
+    *(
+        "--python-exit-code",
+        "--chnames",
+        "--chappend",
+        "--no-deps",
+        "--extra-index-url",
+        "--host",
+        "--port",
+        "--nworkers",
+        "--nthreads",
+    ),
     *(
         "--step",
         "--nproc-per-node",
@@ -118,7 +131,7 @@ def commands_of(page: Path) -> list[tuple[str, list[str]]]:
     """Each block of a page that has commands of ravg, by its marker, with these commands."""
     blocks = []
     for block in BLOCK.finditer(page.read_text(encoding="utf-8")):
-        lines = [line.removeprefix("$ ") for line in block["text"].splitlines()]
+        lines = [part for line in block["text"].splitlines() for part in re.split(r" && |; ", line.removeprefix("$ "))]
         if found := [line for line in lines if re.match(r"(ravg|torchrun) ", line)]:
             blocks.append((block["marker"] or "", found))
     return blocks
