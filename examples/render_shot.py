@@ -37,7 +37,7 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--reference", type=int, default=0, help="samples per pixel of a reference; 0: none")
     parser.add_argument("--reference-frames", metavar="FIRST-LAST", help="frames with a reference; default: all")
     parser.add_argument("--second-reference", action="store_true", help="add reference_b, of other seeds")
-    parser.add_argument("--moving-objects", "--movers", type=int, default=0, help="add objects that cross the crop")
+    parser.add_argument("--moving-objects", type=int, default=0, help="add objects that cross the crop")
     defaults = "Blender's defaults: OIDN with its passes stored, adaptive sampling, clamped indirect light, one seed"
     parser.add_argument("--defaults", action="store_true", help=defaults)
     parser.add_argument("--compact", action="store_true", help="write all channels as half, without denoising depth")

@@ -9,7 +9,7 @@ from typing import Annotated, Any, NamedTuple
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from hybrid.commands.log import LOG, RENAMED, end_log, one_line, start_log, tolerant_streams
+from hybrid.commands.log import LOG, end_log, one_line, start_log, tolerant_streams
 from hybrid.option_texts import TEXTS
 from hybrid.runtime.interrupt import INTERRUPTED, is_interrupt, stop_with_stdin
 from hybrid.runtime.system import expand_home
@@ -29,32 +29,14 @@ class Entry(NamedTuple):
 
 
 COMMANDS = {name: Entry(**entry) for name, entry in TEXTS["commands"].items()}
-# Old name → new name, and options that state the old defaults; accepted for one release.
-OLD_COMMANDS = {"pseudoref": ("denoise", ["--preset=standard"]), "prepare": ("make-clips", [])}
-OLD_OPTIONS = {
-    "--beside": "--with-report",
-    "--contact": "--contact-sheet",
-    "--estimate": "--first-pass",
-    "--give-way": "--aov-sum",
-    "--keep-estimates": "--keep-first-pass",
-    "--loops": "--movies",
-    "--movers": "--moving-objects",
-}
 
 
 class Command(TyperCommand):
-    """A command that accepts old names of options, and recognises a pattern that a shell has expanded."""
+    """A command that recognises a pattern that a shell has expanded."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments; several files where one was expected ask for quotes."""
         files = [argument for argument in args if argument.lower().endswith(".exr")]
-        known = {name for parameter in self.params for name in parameter.opts}
-        for index, argument in enumerate(args):
-            old, equals, value = argument.partition("=")
-            new = OLD_OPTIONS.get(old)
-            if new in known and old not in known:
-                args[index] = f"{new}{equals}{value}"
-                _note_renamed(ctx, old, str(new))
         try:
             return super().parse_args(ctx, args)
         except typer.BadParameter:
@@ -64,10 +46,6 @@ class Command(TyperCommand):
                 said = f"{len(files)} files, of which {files[1]}"
                 raise typer.BadParameter(f'expected one pattern in quotes, such as "*.exr", got {said}') from None
             raise
-
-
-def _note_renamed(ctx: Any, old: str, new: str) -> None:
-    ctx.meta.setdefault(RENAMED, []).append(f"{old} is now {new}; the old name goes in the next release")
 
 
 class LazyCommand(TyperCommand):
@@ -93,7 +71,7 @@ class LazyCommand(TyperCommand):
 
 
 class Commands(TyperGroup):
-    """The commands of `COMMANDS`, also under their old names."""
+    """The commands of `COMMANDS`."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         return [*COMMANDS]
@@ -101,13 +79,6 @@ class Commands(TyperGroup):
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """A command; not yet imported."""
         return LazyCommand(cmd_name, COMMANDS[cmd_name]) if cmd_name in COMMANDS else None
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        if args and args[0] in OLD_COMMANDS:
-            old, (new, options) = args[0], OLD_COMMANDS[args[0]]
-            _note_renamed(ctx, f"ravg {old}", f"ravg {new}{''.join(f' {option}' for option in options)}")
-            args = [new, *options, *args[1:]]
-        return super().resolve_command(ctx, args)
 
 
 app = typer.Typer(

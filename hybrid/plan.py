@@ -35,8 +35,6 @@ STAGES = {
     "clean-alpha": "filter the noise of the alpha channel in space, as a network filters albedo",
     "skip": "leave tiles without noise out of the network",
 }
-#: Old names of stages, accepted for one release.
-OLD_NAMES = {"steady": "stabilize", "mean": "restore-mean", "samples": "blend-samples"}
 NEURAL_STAGES = frozenset({"clean-guides", "stabilize", "alpha", "clean-alpha", "skip"})  # stages of networks alone
 
 # Correlation of the noise of neighbouring pixels, along x or y, whichever is less: as changes of a clean picture add to
@@ -117,8 +115,6 @@ class Rules:
     off: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
-        for name in ("on", "off"):
-            object.__setattr__(self, name, frozenset(OLD_NAMES.get(stage, stage) for stage in getattr(self, name)))
         for name in sorted(self.on | self.off):
             if name not in STAGES:
                 raise ValueError(f"stage is {name!r}, expected one of {', '.join(STAGES)}")

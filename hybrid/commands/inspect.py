@@ -66,7 +66,6 @@ def _inspect(read: ShotInput, rules: Rules, *, as_json: bool) -> None:
             "profile": layers[0].profile,
             "reason": layers[0].reason,
             "findings": [asdict(finding) for finding in findings],
-            "judged": [asdict(finding) for finding in findings],  # the old name, for one release
             "motion": report.readings(),
             **first,
             **({"others": others} if others else {}),

@@ -27,7 +27,6 @@ LOG.propagate = False
 
 LogFormat = Literal["text", "json", "openjd"]
 LABEL_WIDTH = 12
-RENAMED = "ravg.renamed"  # in the context of a command: lines about old names that were used
 # ASCII replacements of the signs that are used here.
 _PLAIN = {"≤": "<=", "×": "x", "–": "-", "−": "-", "—": "-", "…": "...", "·": ".", "≈": "~", "∞": "inf", "→": "->"}
 

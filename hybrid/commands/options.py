@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_t
 
 import typer
 
-from hybrid.commands.log import LOG, RENAMED, LogFormat, start_log
+from hybrid.commands.log import LogFormat, start_log
 from hybrid.option_texts import option_texts
 
 Thing = TypeVar("Thing")
@@ -63,8 +63,6 @@ def command(name: str, *configs: type) -> Callable[[Callable[..., None]], Callab
             if options.quiet and options.verbose:
                 raise typer.BadParameter("expected --quiet or --verbose, got both")
             start_log(options.log_format, options.log_file, quiet=options.quiet, verbose=options.verbose)
-            for line in context.meta.get(RENAMED, ()):
-                LOG.warning(line)
             function(**arguments, **({"context": context} if "context" in own else {}))
 
         keyword = inspect.Parameter.KEYWORD_ONLY

@@ -17,7 +17,7 @@ from hybrid.files.sequences import find_views, name_view, parse_frames
 from hybrid.files.shots import Shot, open_shot
 from hybrid.files.sidecars import names_sequence
 from hybrid.job import import_neural as import_torch
-from hybrid.plan import OLD_NAMES, Plan
+from hybrid.plan import Plan
 from hybrid.runtime.first_run import watch_compiling
 from hybrid.validation import Finding, ValidationReport, find_cut, find_repeat, validate_layers
 
@@ -169,9 +169,5 @@ def log_cuts(plan: Plan, known: Sequence[Finding], *, strict: bool, name: str = 
 
 
 def split_stages(names: Sequence[str] | None) -> tuple[str, ...]:
-    """Split names of stages, and log a line for each old one."""
-    stages = [name for item in names or () for name in item.split(",")]
-    for old in stages:
-        if old in OLD_NAMES:
-            LOG.warning(f"stage {old} is now {OLD_NAMES[old]}; the old name goes in the next release")
-    return tuple(OLD_NAMES.get(name, name) for name in stages)
+    """Split names of stages."""
+    return tuple(name for item in names or () for name in item.split(","))

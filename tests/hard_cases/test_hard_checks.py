@@ -19,7 +19,7 @@ MIDDLE = SCENE.first + 2
 
 
 def draft(folder, out, *more):
-    return main(["pseudoref", str(folder), "-o", str(out), "--preset", "draft", *map(str, more)])
+    return main(["denoise", str(folder), "-o", str(out), "--preset", "draft", *map(str, more)])
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def test_an_estimate_that_cannot_be_right_is_named_and_nothing_is_made_of_it(tmp
 
     estimates = SCENE.write(tmp_path / "estimates", clean=True, edit=edit)
     out = tmp_path / "out"
-    assert draft(SCENE.write(tmp_path / "in"), out, "--estimate", estimates) == 1
+    assert draft(SCENE.write(tmp_path / "in"), out, "--first-pass", estimates) == 1
     assert re.search(f"error: {said}", capsys.readouterr().err)
     assert not list(out.glob("*.exr"))  # all windows have it
 
@@ -85,7 +85,7 @@ def test_few_lost_pixels_of_an_estimate_are_filled_in(tmp_path):
         layers["ViewLayer.Combined"][5, 5:10] = np.nan
 
     estimates = SCENE.write(tmp_path / "estimates", clean=True, edit=edit)
-    assert draft(SCENE.write(tmp_path / "in"), tmp_path / "out", "--estimate", estimates) == 0
+    assert draft(SCENE.write(tmp_path / "in"), tmp_path / "out", "--first-pass", estimates) == 0
     assert all(np.isfinite(color).all() for color in colors(tmp_path / "out").values())
 
 
@@ -130,7 +130,7 @@ def test_absurd_weights_make_no_pictures_that_are_not_finite(tmp_path, capsys, s
     save_model(tmp_path / "w.safetensors", model)
     folder, out = SCENE.write(tmp_path / "in"), tmp_path / "out"
     code = main(
-        ["denoise", str(folder), "-o", str(out), "--estimate", "nlm", "--weights", str(tmp_path / "w.safetensors")]
+        ["denoise", str(folder), "-o", str(out), "--first-pass", "nlm", "--weights", str(tmp_path / "w.safetensors")]
     )
     assert code == 0 or "it was not written" in capsys.readouterr().err
     for path in out.glob("*.exr"):

@@ -108,7 +108,7 @@ def test_each_frame_with_lost_pixels_is_told_of_once(tmp_path, capsys):
             layers["ViewLayer.Combined"][5, 6 : 9 + index] = np.nan
 
     folder = Scene().write(tmp_path / "in", edit=lose)
-    assert main(["pseudoref", str(folder), "-o", str(tmp_path / "out"), "--preset", "draft"]) == 0
+    assert main(["denoise", str(folder), "-o", str(tmp_path / "out"), "--preset", "draft"]) == 0
     said = [line for line in capsys.readouterr().err.splitlines() if "not finite" in line]
     assert said == [
         "warning: frame 1001: 3 pixels were not finite, filled in from neighbours; check the render",

@@ -32,7 +32,7 @@ from tests.scenes import Scene, only
 
 
 def draft(folder, out, *more):
-    return main(["pseudoref", str(folder), "-o", str(out), "--preset", "draft", *more])
+    return main(["denoise", str(folder), "-o", str(out), "--preset", "draft", *more])
 
 
 def contents(folder):
@@ -111,7 +111,7 @@ def test_resume_makes_again_what_was_made_from_something_else(tmp_path, capsys, 
     if what == "a frame that comes late":
         last.rename(tmp_path / "late.exr")
     more = []
-    assert draft(folder, out, "--estimate", str(estimates)) == 0
+    assert draft(folder, out, "--first-pass", str(estimates)) == 0
     before = stamps(out)
     if what == "an older frame":
         render_again(frame, "again", 1e9)
@@ -137,7 +137,7 @@ def test_resume_makes_again_what_was_made_from_something_else(tmp_path, capsys, 
                 os.utime(file, (int(file.stat().st_mtime), int(file.stat().st_mtime)))
         folder, estimates = tmp_path / "elsewhere" / "in", tmp_path / "elsewhere" / "estimates"
     capsys.readouterr()
-    assert draft(folder, out, "--resume", "--estimate", str(estimates), *more) == 0
+    assert draft(folder, out, "--resume", "--first-pass", str(estimates), *more) == 0
     after = stamps(out)
     assert {int(name.split(".")[1]) for name in after if after[name] != before.get(name)} == {*again}
     reasons = re.findall(r"frame (\d+) is made again: (.+)", capsys.readouterr().err)
@@ -184,7 +184,7 @@ def test_a_frame_that_is_rendered_again_while_it_is_used_ends_the_run(tmp_path, 
 def test_resume_of_the_network_gives_the_same_bytes(tmp_path):
     pytest.importorskip("torch")
     folder = Scene().write(tmp_path / "in")
-    words = ["denoise", str(folder), "--estimate", "nlm", "-o"]
+    words = ["denoise", str(folder), "--first-pass", "nlm", "-o"]
     assert main([*words, str(tmp_path / "whole")]) == 0
     assert main([*words, str(tmp_path / "parts")]) == 0
     (tmp_path / "parts" / "shot.1002.exr").unlink()
@@ -438,10 +438,10 @@ def test_memory_is_planned_or_refused(tall, tmp_path, capsys, monkeypatch):
 
 PEAKS = [
     # Size, bytes of a pixel that the network takes, OIDN; peak memory of the command with a limit that it is far below.
-    ((180, 320), None, 0, 0.27),  # pseudoref --preset draft
+    ((180, 320), None, 0, 0.27),  # --preset draft
     ((540, 960), None, 0, 0.81),
-    ((540, 960), None, HOLDS, 1.17),  # with --estimate oidn-best
-    ((540, 960), None, HOLDS_FAST, 0.76),  # with --estimate oidn-fast
+    ((540, 960), None, HOLDS, 1.17),  # with --first-pass oidn-best
+    ((540, 960), None, HOLDS_FAST, 0.76),  # with --first-pass oidn-fast
     ((180, 320), 100, 0, 0.50),  # denoise --preset fast
     ((540, 960), 100, 0, 0.90),
     ((1080, 1920), 100, 0, 2.03),
@@ -565,7 +565,8 @@ def test_memory_that_is_kept_is_not_fetched_page_by_page():
 def test_one_thread_or_two_give_the_same_bytes(tmp_path):
     folder = Scene(height=80, width=96).write(tmp_path / "in")
     for count in ("1", "2"):
-        words = ["-m", "hybrid.cli", "pseudoref", str(folder), "-o", str(tmp_path / count), "--stages", "refine"]
+        words = ["-m", "hybrid.cli", "denoise", str(folder), "-o", str(tmp_path / count)]
+        words += ["--preset", "standard", "--stages", "refine"]
         done = run_alone(*words, NUMBA_NUM_THREADS=count, OMP_NUM_THREADS=count)
         assert done.returncode == 0, done.stderr
     assert contents(tmp_path / "1") == contents(tmp_path / "2")

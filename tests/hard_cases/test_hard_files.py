@@ -47,7 +47,7 @@ def claim(path: Path, width: int, height: int) -> Path:
 @pytest.mark.parametrize("size", [(2**31 - 1, 2**31 - 1), (60_000, 60_000), (2**20, 2**20), (65_000, 4_200)])
 def test_enormous_claims_are_refused_before_memory_is_taken(tmp_path, capsys, size):
     path = claim(tmp_path / "huge.exr", *size)
-    assert main(["pseudoref", str(path), "-o", str(tmp_path / "out")]) == 1
+    assert main(["denoise", str(path), "-o", str(tmp_path / "out"), "--preset", "draft"]) == 1
     assert capsys.readouterr().err.strip().splitlines()[-1].startswith(f"error: {path}")
     assert {path.name for path in tmp_path.glob("out/*")} <= {"ravg"}  # the record of it
 
@@ -57,7 +57,7 @@ def test_the_limit_is_an_option(tmp_path, capsys):
     pixels = Scene.height * Scene.width
     for command in (
         ["inspect", str(folder)],
-        ["pseudoref", str(folder), "-o", str(tmp_path / "out"), "--preset", "draft"],
+        ["denoise", str(folder), "-o", str(tmp_path / "out"), "--preset", "draft"],
     ):
         assert main([*command, "--max-pixels", str(pixels - 1)]) == 1
         assert f"56x40 pixels, more than the {pixels - 1} accepted" in capsys.readouterr().err
@@ -96,7 +96,7 @@ def test_names_from_files_are_only_shown(tmp_path, capsys, name):
         assert all(c.isprintable() or c == "\n" for c in out + err)
     assert sorted(tmp_path.rglob("*")) == before
     out = tmp_path / "out" / "done.exr"
-    assert main(["pseudoref", str(path), "-o", str(out), "--preset", "draft"]) == 0
+    assert main(["denoise", str(path), "-o", str(out), "--preset", "draft"]) == 0
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["done.exr", "ravg"]
     assert sorted(p for p in tmp_path.rglob("*") if tmp_path / "out" not in [p, *p.parents]) == before
     kept = read_exr(out)
@@ -130,11 +130,11 @@ def test_the_output_is_never_an_input_by_another_name(tmp_path, capsys):
     (tmp_path / "soft.exr").symlink_to(source)
     targets = [folder, tmp_path / "link", folder / ".." / "in", tmp_path / "hard.exr", tmp_path / "soft.exr"]
     for target in targets:
-        assert main(["pseudoref", str(source), "-o", str(target), "--preset", "draft"]) == 1
+        assert main(["denoise", str(source), "-o", str(target), "--preset", "draft"]) == 1
         assert "would overwrite an input" in capsys.readouterr().err
     out = ["-o", str(tmp_path / "out"), "--preset", "draft"]
     os.link(source, tmp_path / "look.png")
-    assert main(["pseudoref", str(source), *out, "--preview", str(tmp_path / "look.png")]) == 1
+    assert main(["denoise", str(source), *out, "--preset", "standard", "--preview", str(tmp_path / "look.png")]) == 1
     assert "preview" in capsys.readouterr().err
     assert source.read_bytes() == before
 
@@ -155,7 +155,7 @@ def test_every_relation_of_the_windows_is_kept(tmp_path, windows):
     rng = np.random.default_rng(0)
     channels = {c: rng.random((height, width)).astype(np.float16) for c in "RGBA"}
     path = save(tmp_path / "a.exr", channels, dataWindow=data, displayWindow=display)
-    assert main(["pseudoref", str(path), "-o", str(tmp_path / "out" / "a.exr"), "--preset", "draft"]) == 0
+    assert main(["denoise", str(path), "-o", str(tmp_path / "out" / "a.exr"), "--preset", "draft"]) == 0
     kept = read_exr(tmp_path / "out" / "a.exr")
     for name in ("data_window", "display_window"):
         assert getattr(kept.parts[0], name) == getattr(read_exr(path).parts[0], name)
@@ -172,7 +172,7 @@ def test_tiled_files_stay_tiled(tmp_path):
         type=OpenEXR.tiledimage,
         tiles=tiles,
     )
-    assert main(["pseudoref", str(path), "-o", str(tmp_path / "out" / "a.exr"), "--preset", "draft"]) == 0
+    assert main(["denoise", str(path), "-o", str(tmp_path / "out" / "a.exr"), "--preset", "draft"]) == 0
     header = read_exr(tmp_path / "out" / "a.exr", pixels=False).parts[0].header
     assert header["type"] == OpenEXR.tiledimage
     assert header["tiles"].xSize == 8
@@ -193,7 +193,7 @@ def test_side_outputs_spare_all_that_is_read_and_all_that_is_made(tmp_path, caps
     (tmp_path / "null.png").symlink_to("/dev/null")
     (tmp_path / "folder.png").mkdir()
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file() and path.name != "null.png"}
-    words = ["pseudoref", str(folder), "-o", str(out), "--preset", "draft", "--estimate", str(estimates)]
+    words = ["denoise", str(folder), "-o", str(out), "--preset", "draft", "--first-pass", str(estimates)]
     words += ["--profile", str(profile)]
     same = str(tmp_path / "same.png")
     for more, said in [
@@ -216,6 +216,6 @@ def test_a_folder_for_records_that_leads_elsewhere_is_refused(tmp_path, capsys):
     for path in (out, tmp_path / "elsewhere"):
         path.mkdir()
     (out / "ravg").symlink_to(tmp_path / "elsewhere")
-    assert main(["pseudoref", str(folder), "-o", str(out), "--preset", "draft"]) == 1
+    assert main(["denoise", str(folder), "-o", str(out), "--preset", "draft"]) == 1
     assert "is a link, expected a folder for records" in capsys.readouterr().err
     assert list((tmp_path / "elsewhere").iterdir()) == []

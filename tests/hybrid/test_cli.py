@@ -480,10 +480,9 @@ def test_compare_writes_a_report_and_prints_the_table_of_the_readme(compared, ca
     document = json.loads((out / "results.json").read_text(encoding="utf-8"))
     assert set(document["results"][1]["metrics"]) >= {"ssim", "smape", "relmse_trimmed", "mean_bias"}
 
-    # Finished reports are joined without running anything; the old name of the option is accepted.
-    words = ["compare", "--with-report", out, "--beside", out, "-o", out / "both", "--markdown"]
+    # Finished reports are joined without running anything.
+    words = ["compare", "--with-report", out, "--with-report", out, "-o", out / "both", "--markdown"]
     _, table, err = run(capsys, *words)
-    assert "--beside is now --with-report" in err
     assert table.splitlines()[0].count("hall: PSNR") == 2
     assert "All shots" in (out / "both" / "report.html").read_text(encoding="utf-8")
 

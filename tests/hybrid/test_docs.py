@@ -55,7 +55,6 @@ FOREIGN = {
         "--upgrade",
         "--seed",
         "--compact",
-        "--movers",
     ),
     *("--second-reference", "--sweep"),
 }

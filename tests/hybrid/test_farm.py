@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from hybrid.cli import OLD_OPTIONS, main
+from hybrid.cli import main
 from hybrid.records import read_records
 from tests.scenes import Scene
 
@@ -108,7 +108,7 @@ def test_open_job_description_runs_chunks_and_reads_their_progress(openjd, tmp_p
         "OutputName": "done.####.exr",
         "Frames": "1001-1003",
         "FramesPerTask": 2,
-        "Estimate": "nlm",
+        "FirstPass": "nlm",
         "Ravg": ravg,
     }
     words = [word for name, value in parameters.items() for word in ("-p", f"{name}={value}")]
@@ -128,9 +128,9 @@ def test_the_template_asks_for_frames_that_the_command_knows():
     """The command's options, as the template has them, where openjd-cli is not installed too."""
     text = TEMPLATE.read_text(encoding="utf-8")
     options = {line.split()[1] for line in text.splitlines() if line.strip().startswith("- --")}
-    assert options == {"--output", "--frames", "--preset", "--estimate", "--resume", "--keep-going", "--log-format"}
+    assert options == {"--output", "--frames", "--preset", "--first-pass", "--resume", "--keep-going", "--log-format"}
     shown = _help()
-    assert all(OLD_OPTIONS.get(option, option) in shown for option in options)
+    assert all(option in shown for option in options)
 
 
 def _help():

@@ -202,15 +202,9 @@ def test_the_user_may_force_what_was_measured(shot_folder):
     assert all(d.reason.startswith("forced") for d in forced)
 
 
-def test_old_names_of_stages_stand_for_the_new_ones():
-    assert Rules(on=frozenset({"mean"}), off=frozenset({"steady"})) == Rules(
-        on=frozenset({"restore-mean"}), off=frozenset({"stabilize"})
-    )
-
-
-@pytest.mark.parametrize(("on", "off"), [(["wrap"], []), ([], ["wrap"]), (["warp"], ["warp"])])
+@pytest.mark.parametrize(("on", "off"), [(["wrap"], []), (["steady"], []), ([], ["wrap"]), (["warp"], ["warp"])])
 def test_forcing_nonsense_is_refused(on, off):
-    with pytest.raises(ValueError, match=r"wrap|both"):
+    with pytest.raises(ValueError, match=r"wrap|steady|both"):
         Rules(on=frozenset(on), off=frozenset(off))
 
 

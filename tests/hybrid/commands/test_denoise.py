@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid.cli import COMMANDS, OLD_COMMANDS, OLD_OPTIONS, LazyCommand, main
+from hybrid.cli import main
 from hybrid.files.exr import read_exr
 from hybrid.files.shots import open_shot
 from hybrid.records import read_records
@@ -99,28 +99,6 @@ def test_the_second_pass_starts_from_the_frames_of_the_first(run, tmp_path, caps
     assert (header["first-pass"], header["passes"]) == ("nlm", 2)
     assert "First pass  nlm (asked for); pass 1 of 2 for the last" in capsys.readouterr().err
     assert not list(tmp_path.glob("out*/pass*"))
-
-
-def test_old_names_do_what_they_did_and_say_their_new_ones(shot_folder, tmp_path, capsys):
-    assert main(["pseudoref", str(shot_folder), "-o", str(tmp_path / "old"), "--contact", str(tmp_path / "c.png")]) == 0
-    said = capsys.readouterr().err
-    assert "ravg pseudoref is now ravg denoise --preset=standard; the old name goes in the next release" in said
-    assert "--contact is now --contact-sheet" in said
-    assert (tmp_path / "c.png").stat().st_size > 0
-    assert main(["denoise", str(shot_folder), "-o", str(tmp_path / "new"), "--method", "classical"]) == 0
-    assert "is now" not in capsys.readouterr().err
-    files = [{path.name: path.read_bytes() for path in (tmp_path / n).glob("*.exr")} for n in ("old", "new")]
-    assert files[0] == files[1]
-    assert len(files[0]) == 3
-
-
-def test_old_names_are_those_of_commands_and_options_that_are_there():
-    commands = [LazyCommand(name, entry).load() for name, entry in COMMANDS.items()]
-    options = [{option for parameter in command.params for option in parameter.opts} for command in commands]
-    for old, new in OLD_OPTIONS.items():
-        assert any(new in names and old not in names for names in options)
-    assert {new for new, _ in OLD_COMMANDS.values()} <= {*COMMANDS}
-    assert not {*OLD_COMMANDS} & {*COMMANDS}
 
 
 @pytest.mark.parametrize(

@@ -213,13 +213,11 @@ def test_a_folder_of_an_earlier_version_is_continued(tmp_path, stub):
         read_meta(SHOT, tmp_path)
 
 
-def test_options_reach_the_settings_of_the_shot(tmp_path, stub, capsys):
-    """`--movers`, the name until 0.2, still counts, and the command says what it is called now."""
+def test_options_reach_the_settings_of_the_shot(tmp_path, stub):
     words = ["simulate", "random", "-o", str(tmp_path), "--frames", "1-2", "--levels", "n", "--spp", "2", "--python"]
     words += [stub(), "--film", "640x360", "--center", "0.25,0.5", "--seed", "7", "--halves", "--motion-blur"]
     words += ["--effects", "all", "--animate", "add", "--camera", "random", "--reference", "4"]
-    assert main([*words, "--reference-frames", "2", "--movers", "3"]) == 0
-    assert "--movers is now --moving-objects" in capsys.readouterr().err
+    assert main([*words, "--reference-frames", "2", "--moving-objects", "3"]) == 0
     found = ShotSettings.from_json(json.loads((tmp_path / "meta.json").read_text())["shot"])
     assert found == ShotSettings(
         "random", 7, (1, 2), (320, 180), {"noisy": 2}, reference=4, reference_frames=(2,), film=(640, 360),
