@@ -33,8 +33,8 @@ METHODS = ("noisy", *OIDN, "fast", "balanced", "quality")
 MOST = 65.0
 
 
-def denoise(shot: Shot, method: str) -> list[Array]:
-    """The frames of a shot by a method."""
+def denoise(shot: Shot, method: str, **options: object) -> list[Array]:
+    """The frames of a shot by a method; options are those of a preset."""
     frames = [shot.read(number) for number in shot.numbers]
     if method == "noisy":
         return [frame.color for frame in frames]
@@ -42,7 +42,7 @@ def denoise(shot: Shot, method: str) -> list[Array]:
         return [denoise_oidn(f.color, f.albedo, f.normal, prefilter=OIDN[method]) for f in frames]  # type: ignore
     with tempfile.TemporaryDirectory() as folder:
         pattern = f"{folder}/frame.####.exr"
-        list(denoise_shot(shot, pattern, preset=method))
+        list(denoise_shot(shot, pattern, preset=method, **options))
         made = open_shot(pattern)
         return [made.read(number).color for number in shot.numbers]
 
@@ -53,25 +53,41 @@ def levels(folder: Path) -> Iterator[str]:
     yield from sorted(name for name in found if not name.startswith("reference"))
 
 
-def judge(folder: Path, methods: list[str], results: dict[str, list[float]], out: Path) -> None:
-    """Add the figures of a shot to the results, and write these after each method."""
-    halves = [open_shot(f"{folder}/reference_{half}.####.exr") for half in "ab"]
-    numbers = halves[0].numbers
-    truth = [(halves[0].read(number).color, halves[1].read(number).color) for number in numbers]
-    for level in levels(folder):
-        shot = open_shot(f"{folder}/{level}.####.exr", frames=f"{numbers[0]}-{numbers[-1]}")
-        missing = [method for method in methods if f"{folder.name} {level} {method}" not in results]
+class Truth:
+    """Two references of the frames of a shot that are judged, and the motion between its frames."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        halves = [open_shot(f"{folder}/reference_{half}.####.exr") for half in "ab"]
+        self.numbers = halves[0].numbers
+        self.references = [(halves[0].read(number).color, halves[1].read(number).color) for number in self.numbers]
+
+    def shot(self, level: str) -> Shot:
+        """The frames of a level that have references."""
+        return open_shot(f"{self.folder}/{level}.####.exr", frames=f"{self.numbers[0]}-{self.numbers[-1]}")
+
+    def judge(self, shot: Shot, images: list[Array]) -> list[float]:
+        """PSNR of the images of a shot, and temporal PSNR where there are vectors: means over the frames, dB."""
+        figures = [np.mean([psnr(image, pair) for image, pair in zip(images, self.references, strict=True)])]
         frames = [shot.read(number) for number in shot.numbers]
         motion = [motion_between(*pair) for pair in pairwise(frames)]
-        flows, valid = zip(*motion, strict=True) if motion and None not in motion else ((), ())
-        for method in missing:
-            images = denoise(shot, method)
-            figures = [float(np.mean([psnr(x, r) for x, r in zip(images, truth, strict=True)]))]
-            if flows:
-                figures.append(float(np.mean(np.minimum(temporal_psnr(images, truth, flows, valid), MOST))))
-            results[f"{folder.name} {level} {method}"] = [round(figure, 3) for figure in figures]
+        if motion and None not in motion:
+            flows, valid = zip(*motion, strict=True)
+            figures.append(np.mean(np.minimum(temporal_psnr(images, self.references, flows, valid), MOST)))
+        return [round(float(figure), 3) for figure in figures]
+
+
+def judge(folder: Path, methods: list[str], results: dict[str, list[float]], out: Path) -> None:
+    """Add the figures of a shot to the results, and write these after each method."""
+    truth = Truth(folder)
+    for level in levels(folder):
+        shot = truth.shot(level)
+        for method in methods:
+            if (key := f"{folder.name} {level} {method}") in results:
+                continue
+            results[key] = truth.judge(shot, denoise(shot, method))
             out.write_text(json.dumps(results, indent=0), encoding="utf-8")
-            print(folder.name, level, method, *results[f"{folder.name} {level} {method}"], flush=True)
+            print(key, *results[key], flush=True)
 
 
 def table(results: dict[str, list[float]]) -> str:

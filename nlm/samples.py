@@ -49,7 +49,7 @@ _LIMIT = np.float32(6)
 # k (1 + (f / N)²) times its variance, N the number of samples that make the noise: a variance from a few bright samples
 # is unknown itself. Without f a shot at 54 dB lost 2 dB to five fireflies; with f no shot at 8 to 512 samples loses
 # 0.1. f / N in place of its square loses more of the light that a thousand samples measure.
-_MEANS = (48.0, 1.0, 800.0, 1), (12.0, 7.0, 300.0, 1), (48.0, 4.0, 1000.0, 4)
+_MEANS = (48.0, 1.0, 800.0, 1), (48.0, 4.0, 1000.0, 4)
 # Stops of light in a bin: darkness beside bright places has a mean of its own. Noise that is left in a picture
 # correlates its light with the samples: with bins of 2 stops the classical chain loses 0.44 dB of a shot at 8 samples,
 # with 6 it loses 0.04.
@@ -228,8 +228,8 @@ def _light_around(picture: Floats, noisy: Floats, others: Floats, exposure: floa
 
 def _relative_light(noisy: Floats, neighbours: SampleMean, rate: Floats) -> list[Floats]:
     """Light of a frame over the light of its neighbours (H, W), by least squares around each pixel, over two sizes."""
-    products = np.empty((2, *rate.shape), np.float32)
-    run_bands(_multiply, len(rate), noisy, neighbours, rate, products)
+    weight = np.square(rate) * neighbours.trust
+    products = [weight * np.einsum("yxc,yxc->yx", layer, neighbours.mean) for layer in (noisy, neighbours.mean)]
     factors = []
     for sigma in (_SIGMA, _LIGHT):
         together, alone = (gaussian_mean(product, sigma) for product in products)
@@ -281,7 +281,8 @@ def _energy_of(noisy: Floats, rate: Floats, picture: Floats | None, albedo: Floa
         found = second_differences(np.ascontiguousarray(strip))[top - outer.start :]
         if albedo is not None:
             found = found[: bottom - top] * np.maximum(albedo[rows], _BLACK)
-        run_bands(_energy, bottom - top, found, rate[rows], energy[rows])
+        found = found[: bottom - top] * rate[rows, :, None]
+        energy[rows] = np.einsum("yxc,yxc->yx", found, found) / np.float32(36)  # the squares of the coefficients
     return energy
 
 
@@ -294,39 +295,15 @@ def beside_lamps(picture: Floats, exposure: float) -> Mask:
 def limit_lamps(picture: Floats, samples: Sequence[Floats], exposure: float) -> Floats:
     """Clamp light beyond four exposures (H, W, 3), in each channel, to the brightest of the samples within two pixels.
 
-    `samples` are one or two images; ValueError for more. A denoiser makes up to three times the light of a lamp of
-    10,000 exposures, which no mean of few samples corrects.
+    A denoiser makes up to three times the light of a lamp of 10,000 exposures, which no mean of few samples corrects.
     """
-    if not 1 <= len(samples) <= 2:
-        raise ValueError(f"samples: expected one or two images, got {len(samples)}")
     light = channel_mean(picture)
     lamp = (light > _LAMP * exposure) & np.isfinite(light)  # what is not finite is refused, and not mended
     if not lamp.any():
         return picture
-    held = picture.copy()
-    shown = [np.ascontiguousarray(image, np.float32) for image in (samples[0], samples[-1])]
-    run_bands(_limit_lamps, len(held), lamp, *shown, np.float32(_LAMP * exposure), held)
-    return held
-
-
-@njit(cache=True, nogil=True)
-def _limit_lamps(
-    first: int, last: int, lamp: Mask, samples: Floats, others: Floats, least: np.float32, held: Floats
-) -> None:
-    """Clamp a picture in place, where there are lamps, to the brightest of two samples within two pixels."""
-    height, width, channels = held.shape
-    for y in range(first, last):
-        for x in range(width):
-            if not lamp[y, x]:
-                continue
-            for c in range(channels):
-                brightest = least
-                for row in range(max(y - 2, 0), min(y + 3, height)):
-                    if brightest >= held[y, x, c]:
-                        break
-                    for column in range(max(x - 2, 0), min(x + 3, width)):
-                        brightest = max(brightest, max(samples[row, column, c], others[row, column, c]))
-                held[y, x, c] = min(held[y, x, c], brightest)
+    brightest = cv2.dilate(np.maximum.reduce(samples), np.ones((5, 5), np.uint8))
+    limited = np.minimum(picture, np.maximum(brightest, np.float32(_LAMP * exposure)))
+    return np.where(lamp[..., None], limited, picture)
 
 
 def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
@@ -352,10 +329,10 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
     All in the mean over channels, n the pixels of K: the shrinkage of James and Stein. N counts the samples that make
     the noise: five fireflies determine neither a mean nor its variance. The weight u keeps the light of all pixels
     but those much brighter than their surroundings, which count by their relative error: a lamp that is too bright
-    darkens nothing around it. The means over σ = 48 pixels come first (k = 1, f = 800), then those over 12 (7, 300),
-    and then those over 48 (4, 1000) of pixels of similar light: K is then over each of 4 bins of six stops, a = 0,
-    and a pixel counts in the two bins next to it. Last, with K the mean of the whole picture and
-    u one over the mean, the picture becomes (1 + s D w / K(w u l)) picture, w = u l / (u l + 1), s = max(0, 1 − v / D²
+    darkens nothing around it. The means over σ = 48 pixels come first (k = 1, f = 800), and then those of pixels of
+    similar light (k = 4, f = 1000): K is then over each of 4 bins of six stops, a = 0, and a pixel counts in the two
+    bins next to it. Last, with K the mean of the whole picture and u one over the mean, the picture becomes
+    (1 + s D w / K(w u l)) picture, w = u l / (u l + 1), s = max(0, 1 − v / D²
     − (60 / N)²): right in the relative light, a picture of too little contrast is too dark where it is bright.
     """
     picture, noisy = (np.ascontiguousarray(image, np.float32) for image in (picture, noisy))
@@ -553,31 +530,6 @@ def _average(
                 trust[y, x] = min(greatest - centre, np.float32(1))
                 for c in range(3):
                     mean[y, x, c] /= np.float32(total)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _multiply(first: int, last: int, noisy: Floats, neighbours: SampleMean, rate: Floats, products: Floats) -> None:
-    """Write the products of a frame with its neighbours' mean, and of the mean with itself, relative to the light."""
-    for y in range(first, last):
-        for x in range(rate.shape[1]):
-            together, alone = np.float32(0), np.float32(0)
-            for c in range(3):
-                together += noisy[y, x, c] * neighbours.mean[y, x, c]
-                alone += neighbours.mean[y, x, c] * neighbours.mean[y, x, c]
-            weight = rate[y, x] * rate[y, x] * neighbours.trust[y, x]
-            products[0, y, x] = together * weight
-            products[1, y, x] = alone * weight
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _energy(first: int, last: int, residual: Floats, rate: Floats, energy: Floats) -> None:
-    """Write the squares of second differences, relative to the light, over the sum of their squared coefficients."""
-    for y in range(first, last):
-        for x in range(rate.shape[1]):
-            total = np.float32(0)
-            for c in range(3):
-                total += (residual[y, x, c] * rate[y, x]) ** 2
-            energy[y, x] = total / np.float32(36)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -18,7 +18,7 @@ from hybrid.files.layers import Layers
 from hybrid.runtime.timing import Timings
 from nlm.average import average, reject_outliers
 from nlm.drift import drift_weights, pull_to_centre
-from nlm.gate import SHARE, agreement_weight, color_gate, color_gates
+from nlm.gate import agreement_weight, color_gate, color_gates
 from nlm.interpolation import interpolation_weight, measure_noise
 from nlm.pooling import SampleRange
 from nlm.relight import relight
@@ -31,10 +31,6 @@ FINISHED = 0.1, 0.5
 # The same without noise, in tone-mapped units, and by how many times more single pixels may differ: without the second
 # a shot of sharp outlines loses 1 dB at 128 and 512 samples, half of it with 3; 1 costs still shots up to 8 dB in time.
 FINISHED_FLOOR, FINISHED_DETAIL = 0.001, 2.0
-# The gate's tolerance for estimates, a share of the noise, where light drifts, and the weights by drift of the next
-# frame (`nlm.drift`) below which it counts alone and above which not at all. Averages with half-trusted frames of a
-# moving shadow are worse than the centre alone: one such shot of 8 samples gains 0.2 / 0.3 dB, others change by 0.01.
-DRIFTING_SHARE, DRIFTING = 0.1, (0.6, 0.85)
 # How much more finished pictures lose by a drift than first passes do, whose errors are several times as large: 20 and
 # 100 differ by 0.05 dB, and by 0.25 dB where shadows move.
 DRIFTED = 100
@@ -133,15 +129,13 @@ def align(
         if denoised:
             # By the centre's albedo and not by each frame's own, which may be noisy as the first pass is not.
             pictures /= modulation
-            confidences = _gate_denoised(
-                pictures, centre_irradiance, warped.confidence, coverage, bright.exposure, stages
-            )
-            del coverage  # windows are large
-            for confidence in confidences:
-                for trust, weight in zip(confidence, exact, strict=True):
-                    if weight is not None:
-                        trust *= weight
-            trusted = _trust_denoised(window, pictures, centre_irradiance, confidences, bright.exposure, padded.start)
+            gate = color_gate(pictures, centre_irradiance, bright.exposure)
+            confidence = trust_light(warped.confidence, coverage, gate, stages)
+            del coverage, gate  # windows are large
+            for trust, weight in zip(confidence, exact, strict=True):
+                if weight is not None:
+                    trust *= weight
+            trusted = _trust_denoised(window, pictures, centre_irradiance, confidence, bright.exposure, padded.start)
         else:
             trusted = _trust_noisy(warped, centre_irradiance, bright.exposure, stages)
         sides = found = None
@@ -363,53 +357,25 @@ def _trust_noisy(warped: _Warped, centre_irradiance: Array, exposure: float, sta
     return _Trusted(warped.confidence * color_gate(warped.layers["light"], centre_irradiance, exposure))
 
 
-def _gate_denoised(
-    first_pass: Array,
-    centre_irradiance: Array,
-    confidence: Array,
-    coverage: Array,
-    exposure: float,
-    stages: Collection[str],
-) -> list[Array]:
-    """Combine geometry with the gate by first passes; with the stage "drift" also with a stricter gate."""
-    shares = (SHARE, DRIFTING_SHARE) if "drift" in stages else (SHARE,)
-    gates = color_gates(first_pass, centre_irradiance, exposure, shares)
-    return [trust_light(confidence, coverage, gate, stages) for gate in gates]
-
-
 def _trust_denoised(
     window: Window,
     first_pass: Array,
     centre_irradiance: Array,
-    confidences: list[Array],
+    confidence: Array,
     exposure: float,
     first_row: int,
 ) -> _Trusted:
-    """Multiply confidences of `_gate_denoised`, in place, by the agreement of all neighbours, and measure drift."""
+    """Multiply the confidence, in place, by the agreement of all neighbours, and measure drift."""
     stages, middle = window.stages, len(first_pass) // 2
-    confidence, *strict = confidences
     if "gate" in stages:
         agreement = agreement_weight(first_pass, centre_irradiance, confidence, exposure)
-        for trusted in confidences:
-            trusted[:middle] *= agreement
-            trusted[middle + 1 :] *= agreement
+        confidence[:middle] *= agreement
+        confidence[middle + 1 :] *= agreement
     if "drift" not in stages:
         return _Trusted(confidence)
     weight = drift_weights(first_pass, centre_irradiance, confidence, exposure, first_row=first_row)
-    pull = _stricter_where_light_drifts(weight, confidence, *strict)
     # A copy: a view would keep the weights of all frames in memory.
-    return _Trusted(confidence, pull, weight[middle + 1].copy() if _shows_drift(window) else None)
-
-
-def _stricter_where_light_drifts(weight: Array, confidence: Array, strict: Array) -> Array:
-    """Multiply weights by drift by how much less a strict gate trusts a frame, where light drifts; reuses `strict`."""
-    drifting = 1 - _smooth_step(weight[min(len(weight) // 2 + 1, len(weight) - 1)], *DRIFTING)
-    np.divide(strict, confidence, out=strict, where=confidence > 0)  # at most 1, and any where both are 0
-    strict -= 1
-    strict *= drifting
-    strict += 1
-    strict *= weight
-    return strict
+    return _Trusted(confidence, weight, weight[middle + 1].copy() if _shows_drift(window) else None)
 
 
 def _average_samples(

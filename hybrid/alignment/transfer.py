@@ -1,13 +1,10 @@
 """Transfer curves, each a forward and an inverse function."""
 
-from collections.abc import Callable
-
 import numpy as np
-from numba import njit
-from numpy.typing import NDArray
 
 from hybrid.files.frame import Array
-from loops.parallel import Doubles, Mask, Places, run_bands
+from loops.parallel import Doubles, Mask, Places
+from nlm.average import channel_mean
 
 # Added to the albedo before dividing. Albedo is dimensionless and around 0.05 to 0.9. On black and on purely specular
 # surfaces the quotient is the radiance times at most 1/floor, so the floor bounds how much brighter a neighbour's light
@@ -33,42 +30,19 @@ def demodulate(radiance: Array, albedo: Array) -> Array:
     ``radiance / (albedo + ALBEDO_FLOOR)`` (Bako et al. 2017, Kernel-Predicting Convolutional Networks, section 5.1,
     doi:10.1145/3072959.3073708); with the albedo's mean over channels where radiance has other than three.
     """
-    return _with_divisor(_divide, radiance, albedo)
+    return np.asarray(radiance / _divisor(radiance, albedo), np.float32)
 
 
 def remodulate(irradiance: Array, albedo: Array) -> Array:
     """Invert `demodulate`: multiply by ``albedo + ALBEDO_FLOOR``."""
-    return _with_divisor(_multiply, irradiance, albedo)
+    return np.asarray(irradiance * _divisor(irradiance, albedo), np.float32)
 
 
-def _with_divisor(loop: Callable[..., None], layer: Array, albedo: Array) -> Array:
-    """Divide or multiply a layer (..., H, W, C) by the albedo plus the floor."""
+def _divisor(layer: Array, albedo: Array) -> Array:
+    """The albedo plus the floor, with as many channels as a layer, or one."""
     if layer.shape[-1] != albedo.shape[-1]:
-        albedo = np.broadcast_to(albedo.mean(axis=-1, keepdims=True), (*albedo.shape[:2], layer.shape[-1]))
-    height = len(albedo)
-    result = np.empty(layer.shape, np.float32)
-    given = np.ascontiguousarray(layer, np.float32), np.ascontiguousarray(albedo, np.float32)
-    flat = given[0].reshape(-1, height, albedo[0].size), given[1].reshape(height, -1)
-    run_bands(loop, height, *flat, result.reshape(flat[0].shape))
-    return result
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _divide(first: int, last: int, layer: Array, albedo: Array, result: Array) -> None:
-    floor, zero = np.float32(ALBEDO_FLOOR), np.float32(0)
-    for t in range(len(layer)):
-        for y in range(first, last):
-            for i in range(albedo.shape[1]):
-                result[t, y, i] = layer[t, y, i] / (max(albedo[y, i], zero) + floor)
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _multiply(first: int, last: int, layer: Array, albedo: Array, result: Array) -> None:
-    floor, zero = np.float32(ALBEDO_FLOOR), np.float32(0)
-    for t in range(len(layer)):
-        for y in range(first, last):
-            for i in range(albedo.shape[1]):
-                result[t, y, i] = layer[t, y, i] * (max(albedo[y, i], zero) + floor)
+        albedo = albedo.mean(axis=-1, keepdims=True)
+    return np.maximum(albedo, np.float32(0)) + np.float32(ALBEDO_FLOOR)
 
 
 def compress(radiance: Array, exposure: float) -> Array:
@@ -102,12 +76,9 @@ def _mean_of_lit(radiance: Array) -> float:
     """The exposure of an image, 0 without light."""
     if radiance.size == 0:
         return 0.0
-    rows, columns = (_edges(size) for size in radiance.shape[:2])
-    level = np.empty(radiance.shape[:2], np.float32)
-    sums, counts = np.zeros((2, len(rows) - 1, len(columns) - 1))
-    image = np.ascontiguousarray(radiance, np.float32)
-    run_bands(_bin_levels, len(sums), image, rows, columns, level, sums, counts)
-    means = np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0)
+    level = channel_mean(radiance)
+    finite = np.isfinite(level)
+    means = _bin_means(level, finite)
     # Far below any surface next to the brightest lamp that a half float holds, and far above the residue of a denoiser
     # on black: the first guess needs no exposure.
     brightest = float(np.nanmax(means, initial=0.0))
@@ -115,11 +86,9 @@ def _mean_of_lit(radiance: Array) -> float:
     exposure = 0.0
     while lit.any():
         # Lamps, sky in a window and fireflies are few and bright; they must not decide the exposure.
-        size = int(counts[lit].sum())
-        bright = _find_greatest(level.view(np.uint32), rows, columns, lit, size // 100)
-        limited = np.zeros_like(sums)
-        run_bands(_bin_limited, len(sums), level, rows, columns, lit, np.uint32(bright).view(np.float32), limited)
-        exposure = float(limited[lit].sum()) / size
+        levels = level[finite & _in_bins(lit, level.shape)]
+        place = len(levels) - 1 - len(levels) // 100
+        exposure = float(np.minimum(levels, np.partition(levels, place)[place]).mean(dtype=np.float64))
         still_lit = lit & (means > LIT * exposure)
         if (still_lit == lit).all():
             break
@@ -154,10 +123,9 @@ def autoexposure(radiance: Array, *, dark: float = BLACK, exposure: float = 1.0)
     ``0.18 / 2^mean(log2 L)``, L the mean luminances above `dark` of bins of at most 16×16 pixels, as in OIDN's
     ``training/color.py``; `network.unet.autoexposure` is the same in torch.
     """
-    rows, columns = (_edges(size) for size in radiance.shape[:2])
-    means = np.empty((len(rows) - 1, len(columns) - 1))
-    image = np.ascontiguousarray(radiance, np.float32)
-    run_bands(_bin_luminances, len(means), image, np.float32(exposure), rows, columns, means)
+    image = np.maximum(radiance / np.float32(exposure), 0)
+    luminance = image @ np.array([0.212671, 0.715160, 0.072169], np.float32)  # their sum is below 1: none overflows
+    means = _bin_means(luminance, np.isfinite(luminance))
     lit = means[means > dark]
     return float(MIDDLE_GRAY / np.exp2(np.log2(lit).mean())) if lit.size else 1.0
 
@@ -168,93 +136,17 @@ def _edges(length: int) -> Places:
     return np.asarray(np.arange(bins + 1) * length // bins, np.intp)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def _bin_levels(
-    first: int, last: int, image: Array, rows: Places, columns: Places, level: Array, sums: Doubles, counts: Doubles
-) -> None:
-    """Write the mean over channels, NaN where it is not finite; in each bin the sum and number of finite means."""
-    for row in range(first, last):
-        for y in range(rows[row], rows[row + 1]):
-            for column in range(sums.shape[1]):
-                total, count = np.float64(0), 0
-                for x in range(columns[column], columns[column + 1]):
-                    value = np.float32(0)
-                    for c in range(image.shape[2]):
-                        value += image[y, x, c]
-                    value /= np.float32(image.shape[2])
-                    finite = np.isfinite(value)
-                    level[y, x] = value if finite else np.float32(np.nan)
-                    total += value if finite else np.float32(0)
-                    count += finite
-                sums[row, column] += total
-                counts[row, column] += count
+def _bin_means(layer: Array | Doubles, finite: Mask) -> Doubles:
+    """Mean of the finite values of each bin of a layer (H, W), NaN for a bin without."""
+    rows, columns = (_edges(size)[:-1] for size in layer.shape)
+    sums, counts = (
+        np.add.reduceat(np.add.reduceat(part, columns, axis=1, dtype=kind), rows, axis=0)
+        for part, kind in ((np.where(finite, layer, 0), np.float64), (finite, np.intp))
+    )
+    return np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0)
 
 
-@njit(nogil=True, cache=True)
-def _find_greatest(bits: NDArray[np.uint32], rows: Places, columns: Places, lit: Mask, rank: int) -> int:
-    """Bits of the level of this rank, the greatest first, in the lit bins; NaN is left out."""
-    # Two digits of 16 bits each, in an order of integers that is that of floats.
-    prefix, left = np.uint32(0), rank
-    for digit in range(2):
-        counts = np.zeros(1 << 16, np.int64)
-        for row in range(lit.shape[0]):
-            for column in range(lit.shape[1]):
-                if not lit[row, column]:
-                    continue
-                for y in range(rows[row], rows[row + 1]):
-                    for x in range(columns[column], columns[column + 1]):
-                        value = bits[y, x]
-                        if value & np.uint32(0x7FFFFFFF) > np.uint32(0x7F800000):
-                            continue
-                        negative = value >> np.uint32(31)
-                        key = value ^ (np.uint32(0xFFFFFFFF) if negative else np.uint32(0x80000000))
-                        if digit == 0:
-                            counts[key >> np.uint32(16)] += 1
-                        elif key >> np.uint32(16) == prefix:
-                            counts[key & np.uint32(0xFFFF)] += 1
-        place = len(counts) - 1
-        while place > 0 and left >= counts[place]:
-            left -= counts[place]
-            place -= 1
-        prefix = np.uint32(prefix << np.uint32(16)) | np.uint32(place)
-    return int(prefix ^ (np.uint32(0x80000000) if prefix >> np.uint32(31) else np.uint32(0xFFFFFFFF)))
-
-
-@njit(nogil=True, cache=True)
-def _bin_limited(
-    first: int, last: int, level: Array, rows: Places, columns: Places, lit: Mask, limit: np.float32, sums: Doubles
-) -> None:
-    """Sum in each lit bin the levels, each up to the limit."""
-    for row in range(first, last):
-        for y in range(rows[row], rows[row + 1]):
-            for column in range(lit.shape[1]):
-                if lit[row, column]:
-                    total = np.float64(0)
-                    for x in range(columns[column], columns[column + 1]):
-                        value = level[y, x]
-                        total += min(value, limit) if value == value else np.float32(0)
-                    sums[row, column] += total
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _bin_luminances(
-    first: int, last: int, image: Array, exposure: np.float32, rows: Places, columns: Places, means: Doubles
-) -> None:
-    """Mean luminance of each bin, without values that are not finite; NaN for a bin without others."""
-    zero = np.float32(0)
-    for row in range(first, last):
-        for column in range(means.shape[1]):
-            total, count = np.float64(0), 0
-            for y in range(rows[row], rows[row + 1]):
-                for x in range(columns[column], columns[column + 1]):
-                    # float64: no sum overflows
-                    red, green, blue = image[y, x, 0] / exposure, image[y, x, 1] / exposure, image[y, x, 2] / exposure
-                    # Written so that NaN remains.
-                    red, green, blue = (
-                        zero if red < zero else red, zero if green < zero else green, zero if blue < zero else blue
-                    )  # fmt: skip
-                    value = 0.212671 * red + 0.715160 * green + 0.072169 * blue
-                    if np.isfinite(value):
-                        total += value
-                        count += 1
-            means[row, column] = total / count if count else np.nan
+def _in_bins(lit: Mask, shape: tuple[int, ...]) -> Mask:
+    """The pixels (H, W) of some bins."""
+    rows, columns = (np.diff(_edges(size)) for size in shape)
+    return np.repeat(np.repeat(lit, rows, axis=0), columns, axis=1)

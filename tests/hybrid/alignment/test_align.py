@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid.alignment import align as alignment
 from hybrid.alignment.align import align
 from hybrid.alignment.measure import least_outline_noise
 from hybrid.alignment.transfer import ALBEDO_FLOOR
@@ -103,37 +102,6 @@ def test_detail_that_all_neighbours_lack_takes_their_confidence(tmp_path):
     assert neighbours[..., :16].max() < 0.1
     assert neighbours[..., 44:].min() > 0.5
     assert aligned.confidence[2].min() == 1
-
-
-def test_where_light_drifts_estimates_count_less(tmp_path, monkeypatch):
-    """By less than the noise: the gate passes it, and averages of half-trusted frames are worse than the centre."""
-    scene = replace(SCENE, height=96, width=192, step=(0, 0), noise=0.3)
-
-    def brighter(light, index):
-        light = light.copy()
-        light[:, 96:] *= np.float32(1 + 0.04 * index)
-        return light
-
-    def brighten(index, layers):
-        layers["ViewLayer.Combined"] = brighter(layers["ViewLayer.Combined"], index)
-
-    def estimate(frame):
-        errors = np.random.default_rng(frame.number).normal(1, 0.01, frame.color.shape).astype(np.float32)
-        return brighter(scene.clean(0)["ViewLayer.Combined"], frame.number - scene.first) * errors
-
-    window = FrameStream(
-        open_shot(scene.write(tmp_path, edit=brighten)), only({"warp", "gate", "drift"}), first_pass=PerFrame(estimate)
-    ).window(MIDDLE)
-    strict = align(window)
-    monkeypatch.setattr(alignment, "DRIFTING_SHARE", alignment.SHARE)
-    lenient = align(window)
-    np.testing.assert_array_equal(strict.confidence, lenient.confidence)
-    still, moving = (
-        [abs(made.first_pass[1, :, part] - made.first_pass[2, :, part]).mean() for made in (strict, lenient)]
-        for part in (np.s_[:64], np.s_[128:])
-    )
-    assert moving[0] < 0.8 * moving[1]
-    assert still[0] > 0.95 * still[1]
 
 
 @pytest.mark.parametrize("stages", [{"blend-samples"}, {"blend-samples", "drift"}, {"drift"}])
