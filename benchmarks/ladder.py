@@ -5,7 +5,8 @@
 A folder holds LEVEL.####.exr, or several levels of a shot, and reference_a.####.exr and reference_b.####.exr, two
 independent renders of the frames to judge, as `ravg simulate --levels s008=8,s032=32 --second-reference` writes them.
 Frames without a reference serve as neighbours. Figures are PSNR and temporal PSNR (at most 65 dB, where the noise of
-references begins) on x / (1 + x), means over the frames. Figures that are in the JSON file already are kept.
+references begins) on x / (1 + x), means over the frames, and CPU seconds a frame. Figures that are in the JSON file
+already are kept.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import json
 import re
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -85,7 +87,10 @@ def judge(folder: Path, methods: list[str], results: dict[str, list[float]], out
         for method in methods:
             if (key := f"{folder.name} {level} {method}") in results:
                 continue
-            results[key] = truth.judge(shot, denoise(shot, method))
+            begun = time.process_time()
+            images = denoise(shot, method)
+            seconds = (time.process_time() - begun) / len(images)
+            results[key] = [*truth.judge(shot, images), round(seconds, 2)]
             out.write_text(json.dumps(results, indent=0), encoding="utf-8")
             print(key, *results[key], flush=True)
 
@@ -94,37 +99,52 @@ def table(results: dict[str, list[float]]) -> str:
     """Means of each level and method, in Markdown."""
     rows = [key.split(" ") for key in results]
     names = list(dict.fromkeys(level for _, level, _ in rows))
-    lines = ["| method | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
+    lines = ["| method | " + " | ".join(names) + " | CPU time |", "|---" * (len(names) + 2) + "|"]
     for method in dict.fromkeys(method for *_, method in rows):
         cells = []
         for level in names:
-            figures = [v for key, v in results.items() if key.endswith(f" {level} {method}")]
+            figures = [v[:-1] for key, v in results.items() if key.endswith(f" {level} {method}")]
             cells.append(" / ".join(f"{np.mean(column):.2f}" for column in zip(*figures, strict=True)))
+        seconds = [values[-1] for key, values in results.items() if key.endswith(f" {method}")]
+        cells.append(f"{np.median(seconds):.2f} s")
         lines.append(f"| {method} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
 def draw(results: dict[str, list[float]], path: Path) -> None:
-    """Draw both figures against the samples that names of levels end with, such as s032."""
+    """Draw both figures against the samples that names of levels end with, such as s032, and PSNR against CPU time."""
     import matplotlib
 
     matplotlib.use("svg")
     from matplotlib import pyplot
 
-    _, axes = pyplot.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
-    for axis, index, title in zip(axes, (0, 1), ("PSNR, dB", "temporal PSNR, dB"), strict=True):
-        for method in dict.fromkeys(key.split(" ")[2] for key in results):
-            points: dict[int, list[float]] = {}
-            for key, figures in results.items():
-                _, level, name = key.split(" ")
-                if name == method:
-                    points.setdefault(int(level.lstrip("s")), []).append(figures[index])
-            style = ":" if method == "noisy" else "--" if method in OIDN else "-"
-            axis.plot(list(points), [np.mean(values) for values in points.values()], style, marker=".", label=method)
+    _, axes = pyplot.subplots(1, 3, figsize=(13, 3.4), layout="constrained")
+    for method in dict.fromkeys(key.split(" ")[2] for key in results):
+        points: dict[int, list[list[float]]] = {}
+        for key, figures in results.items():
+            _, level, name = key.split(" ")
+            if name == method:
+                points.setdefault(int(level.lstrip("s")), []).append(figures)
+        style = ":" if method == "noisy" else "--" if method in OIDN else "-"
+        for index, axis in enumerate(axes[:2]):
+            means = [np.mean([figures[index] for figures in shots]) for shots in points.values()]
+            axis.plot(list(points), means, style, marker=".", label=method)
+            axis.set_xticks(sorted(points), [str(count) for count in sorted(points)], minor=False)
+        if method != "noisy":
+            every = [figures for shots in points.values() for figures in shots]
+            accuracy, seconds = (
+                np.mean([figures[0] for figures in every]),
+                np.median([figures[-1] for figures in every]),
+            )
+            (line,) = axes[0].lines[-1:]
+            axes[2].plot(seconds, accuracy, "o", color=line.get_color())
+            axes[2].annotate(method, (seconds, accuracy), xytext=(5, 4), textcoords="offset points", fontsize=8)
+    for axis, title in zip(axes, ("PSNR, dB", "temporal PSNR, dB", "PSNR, dB, mean of all levels"), strict=True):
         axis.set(xscale="log", xlabel="samples per pixel", title=title)
-        axis.set_xticks(sorted(points), [str(count) for count in sorted(points)], minor=False)
         axis.minorticks_off()
         axis.grid(alpha=0.3)
+    axes[2].set(xscale="linear", xlabel="CPU seconds a frame", xlim=(0, None))
+    axes[2].margins(0.15)
     axes[0].legend(frameon=False, fontsize=8)
     pyplot.savefig(path, dpi=110)
 
