@@ -164,6 +164,13 @@ def test_an_unmarked_block_of_commands_is_noticed(tmp_path):
     assert commands_of(tmp_path / "page.md") == [("", ["ravg denoise shot -o out"])]
 
 
+def test_every_system_runs_the_tests_as_the_readme_says():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    (line,) = [block["text"] for block in BLOCK.finditer(text) if block["marker"] == "test"]
+    assert line.endswith(" && pytest")
+    assert f"      - run: {line}\n" in (ROOT / ".github" / "workflows" / "tests.yml").read_text(encoding="utf-8")
+
+
 @pytest.fixture(scope="module")
 def options():
     """Command → its options."""
