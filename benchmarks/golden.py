@@ -26,7 +26,7 @@ import OpenEXR
 HERE = Path(__file__).resolve().parent.parent
 SHOT = HERE / "examples" / "shot"
 BF16, F32 = ["--precision", "bfloat16"], ["--precision", "float32"]
-#: Name → shot and arguments. Old option names are used on purpose: they have to work for one release.
+#: Name → shot and arguments.
 CONFIGURATIONS: dict[str, tuple[str, list[str]]] = {
     "fast": ("plain", ["denoise", "--preset", "fast", *BF16]),
     "fast-float32": ("plain", ["denoise", "--preset", "fast", *F32]),
@@ -35,23 +35,26 @@ CONFIGURATIONS: dict[str, tuple[str, list[str]]] = {
     "quality": ("plain", ["denoise", "--preset", "quality", *BF16]),
     "quality-float32": ("plain", ["denoise", "--preset", "quality", *F32]),
     "kernels": ("plain", ["denoise", "--weights", "tkpcn.safetensors", *F32]),
-    "draft": ("plain", ["pseudoref", "--preset", "draft"]),
-    "standard": ("plain", ["pseudoref", "--preset", "standard"]),
-    "final": ("plain", ["pseudoref", "--preset", "final"]),
-    "pseudoref-sequence": ("plain", ["pseudoref", "--estimate", "sequence/reference.####.exr"]),
-    "nlm": ("plain", ["denoise", "--estimate", "nlm", *F32]),
-    "bundled": ("plain", ["denoise", "--estimate", "bundled", *F32]),
-    "sequence": ("plain", ["denoise", "--estimate", "sequence/reference.####.exr", *F32]),
-    "oidn-best": ("plain", ["denoise", "--estimate", "oidn-best", *F32]),
-    "estimate-none": ("plain", ["denoise", "--estimate", "none", *F32]),
-    "bands": ("tall", ["denoise", "--estimate", "nlm", "--max-memory", "690M", *F32]),
-    "bands-final": ("tall", ["pseudoref", "--preset", "final", "--max-memory", "370M"]),
+    "draft": ("plain", ["denoise", "--method", "classical", "--preset", "draft"]),
+    "standard": ("plain", ["denoise", "--method", "classical", "--preset", "standard"]),
+    "final": ("plain", ["denoise", "--method", "classical", "--preset", "final"]),
+    "classical-sequence": (
+        "plain",
+        ["denoise", "--method", "classical", "--first-pass", "sequence/reference.####.exr"],
+    ),
+    "nlm": ("plain", ["denoise", "--first-pass", "nlm", *F32]),
+    "bundled": ("plain", ["denoise", "--first-pass", "bundled", *F32]),
+    "sequence": ("plain", ["denoise", "--first-pass", "sequence/reference.####.exr", *F32]),
+    "oidn-best": ("plain", ["denoise", "--first-pass", "oidn-best", *F32]),
+    "first-pass-none": ("plain", ["denoise", "--first-pass", "none", *F32]),
+    "bands": ("tall", ["denoise", "--first-pass", "nlm", "--max-memory", "690M", *F32]),
+    "bands-final": ("tall", ["denoise", "--method", "classical", "--preset", "final", "--max-memory", "370M"]),
     "views": ("views", ["denoise", *F32]),
     "aov-layers": ("aovs", ["denoise", "--aov", "all", *F32]),
-    "aov-beauty": ("aovs", ["denoise", "--aov", "all", "--give-way", "beauty", *F32]),
+    "aov-beauty": ("aovs", ["denoise", "--aov", "all", "--aov-sum", "beauty", *F32]),
     "passes": ("plain", ["denoise", "--passes", "2", *F32]),
     "stages-on": ("plain", ["denoise", "--stages", "dense-flow,outliers,fireflies", *F32]),
-    "stages-off": ("plain", ["denoise", "--no-stages", "gate,demodulate,prefilter,samples", *F32]),
+    "stages-off": ("plain", ["denoise", "--no-stages", "gate,demodulate,prefilter,blend-samples", *F32]),
     "missing": ("missing", ["denoise", "--keep-going", *F32]),
     "cut": ("cut", ["denoise", *F32]),
     "still": ("still", ["denoise", "--preset", "quality", *F32]),

@@ -64,6 +64,8 @@ class Job:
         arguments += [f"--output={folder}", f"--frames={frames.ranges(there)}"]
         if chosen.light_passes:
             arguments.append("--aov=all")
+        if chosen.strength < 1:
+            arguments.append(f"--strength={chosen.strength:.6g}")
         if self._keep:
             arguments.append("--resume")
         outputs = scenes.denoised_files(scene)

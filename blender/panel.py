@@ -37,6 +37,7 @@ class OutputPanel(bpy.types.Panel):
         column = layout.column()
         column.prop(scene.ravg, "preset")
         column.prop(scene.ravg, "light_passes")
+        column.prop(scene.ravg, "strength")
         # Names and buttons have lines of their own: side by side, Blender cuts them off at the panel's usual width.
         for name, default in (("noisy", scenes.noisy_pattern(scene)), ("folder", str(scenes.output_folder(scene)))):
             column.label(text=scene.ravg.bl_rna.properties[name].name)

@@ -316,7 +316,7 @@ def _folders(node: bpy.types.Node) -> Iterator[str]:
     for name in names:
         # A name may begin with a folder, and be empty after it. Blender joins both, whatever the name begins with.
         path = absolute(os.path.join(absolute(base or "/"), f"{name}_".lstrip("/\\")))
-        # Since Blender 5.0 braces hold variables, which may stand for any name.
+        # Since Blender 4.5 braces hold variables, which may stand for any name.
         yield re.sub(r"\{[^{}]*\}", "*", glob.escape(str(path.parent)))
 
 
@@ -397,8 +397,8 @@ def _owner(scene: bpy.types.Scene, path: str) -> tuple[object, str]:
 
 
 def _literal(path: str) -> str:
-    """Escape a path for Blender's Output Path, in which braces hold variables since 5.0."""
-    return path.replace("{", "{{").replace("}", "}}") if bpy.app.version >= (5, 0, 0) else path
+    """Escape a path for Blender's Output Path, in which braces hold variables since 4.5."""
+    return path.replace("{", "{{").replace("}", "}}") if bpy.app.version >= (4, 5, 0) else path
 
 
 def _set(scene: bpy.types.Scene, path: str, value: object) -> None:

@@ -43,6 +43,14 @@ class SceneSettings(bpy.types.PropertyGroup):
         description="Denoise the light passes too, and keep their sum equal to the denoised image",
         default=False,
     )
+    strength: bpy.props.FloatProperty(
+        name="Strength",
+        description="Share of the noise that is removed: below 1 grain stays",
+        subtype="FACTOR",
+        default=1.0,
+        min=0.0,
+        max=1.0,
+    )
     noisy: bpy.props.StringProperty(
         name="Noisy Frames",
         description="Path of the noisy frames, written as an Output Path; default: beside the file",

@@ -178,7 +178,7 @@ def denoise_arrays(
         stream = FrameStream(
             shot, chosen.rules, source.first_pass, radius=denoiser.radius, filter_guides=denoiser.filter_guides
         )
-        denoise = FrameDenoiser(stream, denoiser)
+        denoise = FrameDenoiser(stream, denoiser, strength=chosen.strength)
         for number in wanted:
             made = denoise.make(number)
             layers = {"color": made.denoised.color, **made.denoised.aovs, **shot.kept(number)}

@@ -91,6 +91,7 @@ class DenoiseOptions:
     first_pass: str = ""
     keep_first_pass: str | None = None
     passes: int = 1
+    strength: float = 1.0
     breakdown: Path | None = None
     aov_sum: Literal["layers", "beauty"] = "layers"
     stages: Collection[str] = ()
@@ -156,6 +157,10 @@ class DenoiseOptions:
                 raise ValueError(f"{name} is {number}, expected {bound}")
         if self.threshold is not None and not 0 <= self.threshold < 1:
             raise ValueError(f"threshold is {self.threshold}, expected 0 <= threshold < 1, in units of 1/K")
+        if not 0 <= self.strength <= 1:
+            raise ValueError(
+                f"strength is {self.strength}, expected 0 <= strength <= 1, the share of the noise to remove"
+            )
         if self.budget is not None:
             parse_budget(self.budget)
         if self.max_memory is not None:
@@ -169,6 +174,8 @@ class DenoiseOptions:
             raise ValueError(
                 "--budget chooses the preset, expected no other --preset than auto with it, and no --weights"
             )
+        if self.strength < 1 and self.passes > 1:
+            raise ValueError("--strength keeps noise as rendered, which no second pass reads, expected --passes 1")
         if self.breakdown is not None and self.max_memory is not None:
             raise ValueError("--breakdown needs whole frames, expected no --max-memory with it")
         forced = Rules(frozenset(self.stages), frozenset(self.no_stages))  # refuses stages that do not exist
@@ -487,6 +494,7 @@ class Job:
             "aov-sum": options.aov_sum,
             "first-pass": "sequence" if first_pass.files else options.first_pass,
             "passes": options.passes,
+            "strength": float(options.strength),
             "breakdown": options.breakdown is not None,
             "device": {**self.denoiser.devices, **({"oidn": first_pass.device} if first_pass.device else {})},
             **self.denoiser.settings,
@@ -552,6 +560,7 @@ class Job:
                     options.rules,
                     replace(settings, resume=options.resume and last, keep_going=options.keep_going and last),
                     radius=self.denoiser.radius,
+                    strength=options.strength,
                     timings=self.timings,
                 )
                 for frame in frames:

@@ -86,6 +86,7 @@ def denoise_frames(
     settings: RunSettings = RunSettings(),
     *,
     radius: int = 2,
+    strength: float = 1.0,
     timings: Timings | None = None,
 ) -> Iterator[Finished | Failed]:
     """Denoise every frame of a shot and write it; yield `Finished`, or `Failed` with `keep_going`, in their order.
@@ -107,7 +108,7 @@ def denoise_frames(
     with ExitStack() as threads:
         reader = threads.enter_context(ThreadPoolExecutor(1, "read"))
         writer = _Writer(threads.enter_context(ThreadPoolExecutor(1, "write")), settings.keep_going, timings)
-        frames = _ShotDenoiser(views, denoise, rules, settings, radius, reader, timings)
+        frames = _ShotDenoiser(views, denoise, rules, settings, radius, strength, reader, timings)
         following = dict(pairwise(shot.numbers))
         for number, path in paths.items():
             made: Finished | Failed | Callable[[], Finished]
@@ -163,6 +164,7 @@ class _ShotDenoiser:
         rules: Rules,
         settings: RunSettings,
         radius: int,
+        strength: float,
         thread: ThreadPoolExecutor,
         timings: Timings,
     ) -> None:
@@ -183,7 +185,9 @@ class _ShotDenoiser:
                 timings=timings,
                 keeper=keeper,
             )
-            self.denoisers.append(FrameDenoiser(stream, denoise, rows=settings.rows, keep_going=settings.keep_going))
+            self.denoisers.append(
+                FrameDenoiser(stream, denoise, rows=settings.rows, keep_going=settings.keep_going, strength=strength)
+            )
 
     def make(self, number: int, path: Path, following: int | None) -> Finished | Callable[[], Finished]:
         """Denoise a frame and return the function that writes it; or the frame, if it is there already.

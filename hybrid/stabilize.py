@@ -17,6 +17,7 @@ from hybrid.alignment.prepare import ALPHA, PreparedFrame
 from hybrid.alignment.transfer import measure_typical_exposure
 from hybrid.alignment.unfiltered import as_gray
 from hybrid.alignment.window import AlignedWindow, Trust, Window
+from hybrid.files.frame import Frame
 from hybrid.plan import Plan
 from hybrid.stream import FrameStream
 from hybrid.validation import find_lost_light, find_nonfinite
@@ -117,7 +118,8 @@ class FrameDenoiser:
     """Denoises the frames of a shot, one after the other.
 
     With `rows` only so many rows of a frame are worked on at a time, with the same result. With `keep_going` a
-    neighbouring frame that cannot be denoised is left out of the average.
+    neighbouring frame that cannot be denoised is left out of the average. `strength` is the share of the noise that is
+    removed, in [0, 1].
 
     With d the denoised windows, W the warp to the frame t, R the relighting to its light (`nlm.relight`) and c the
     confidence of their comparison (`hybrid.alignment.align.align_results`), 1 for the frame itself, the result of t is
@@ -128,12 +130,19 @@ class FrameDenoiser:
     """
 
     def __init__(
-        self, stream: FrameStream, denoise: DenoiseWindow, *, rows: int | None = None, keep_going: bool = False
+        self,
+        stream: FrameStream,
+        denoise: DenoiseWindow,
+        *,
+        rows: int | None = None,
+        keep_going: bool = False,
+        strength: float = 1.0,
     ) -> None:
         self.stream = stream
         self.denoise = denoise
         self.rows = rows or stream.shot.shape[0]
         self.keep_going = keep_going
+        self.strength = strength
         self._results: dict[int, WindowResult] = {}
 
     def make(self, number: int) -> FrameResult:
@@ -166,6 +175,8 @@ class FrameDenoiser:
             if frame.spread is not None:
                 denoised = _with_filter(denoised, frame)
             denoised, beyond = _with_unfiltered(denoised, frame), frame.unfiltered.count
+            if self.strength < 1:
+                denoised = _with_noise(denoised, self.stream.shot.read(number), 1 - self.strength)
         return FrameResult(
             denoised,
             result.plan,
@@ -454,3 +465,17 @@ def _with_unfiltered(denoised: Denoised, frame: PreparedFrame) -> Denoised:
     aovs |= {name: unfiltered.without_empty(aovs[name]) for name in aovs.keys() & denoised.parts}
     guide = frame.guide if unfiltered.negative else None
     return replace(denoised, color=unfiltered.restore(denoised.color, guide), aovs=aovs)
+
+
+def _with_noise(denoised: Denoised, rendered: Frame, share: float) -> Denoised:
+    """The layers with a share of the frame's noise; where it holds NaN or infinities they stay as they are."""
+
+    def blend(layer: Array, noisy: Array) -> Array:
+        noisy = noisy.reshape(layer.shape)
+        with np.errstate(invalid="ignore", over="ignore"):  # infinities less infinities
+            blended = layer + np.float32(share) * (noisy - layer)
+        return np.where(np.isfinite(blended), blended, layer)
+
+    named = {**rendered.aovs} if rendered.alpha is None else {**rendered.aovs, ALPHA: rendered.alpha}
+    aovs = {name: blend(layer, named[name]) if name in named else layer for name, layer in denoised.aovs.items()}
+    return replace(denoised, color=blend(denoised.color, rendered.color), aovs=aovs)

@@ -6,6 +6,7 @@ the environment variable RAVG_COMMAND.
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import sys
@@ -247,6 +248,7 @@ def test_the_compositor_shows_each_denoised_frame_at_its_time(blender, shot):
     """Blender itself reads the frames: what its compositor writes is what ravg has made."""
     code = """
     scene.ravg.preset = "average"
+    scene.ravg.strength = 0.5
     bpy.ops.ravg.denoise()
     exec(COMPOSE)
     movie("composed")
@@ -258,6 +260,8 @@ def test_the_compositor_shows_each_denoised_frame_at_its_time(blender, shot):
             seen = file.channels()["RGB" if "RGB" in file.channels() else "RGBA"].pixels[..., :3]
         denoised = picture(shot.parent / "frames" / "denoised" / f"shot_{frame:04d}.exr")
         np.testing.assert_allclose(seen, denoised, rtol=1e-3, atol=1e-4)
+    with OpenEXR.File(str(shot.parent / "frames" / "denoised" / "shot_0004.exr"), header_only=True) as file:
+        assert json.loads(file.header()["ravg/settings"])["strength"] == 0.5
 
 
 FOLLOWED = """

@@ -36,7 +36,15 @@ def test_the_panel_of_a_job_shows_how_far_it_is_and_a_way_to_stop_it(blender, st
     begin = "from bl_ext.user_default.ravg import scenes; jobs.begin(scene); scenes.override(scene, replace=True)"
     code = f"{DRAWN}{begin}; answer = draw()"
     drawn = blender.run(code, blend=rendered, command=stub)
-    assert drawn == ["Preset", "Light Passes", "Noisy Frames", "Denoised Frames", "Rendering: 0 of 0 frames", "Stop"]
+    assert drawn == [
+        "Preset",
+        "Light Passes",
+        "Strength",
+        "Noisy Frames",
+        "Denoised Frames",
+        "Rendering: 0 of 0 frames",
+        "Stop",
+    ]
 
 
 def test_the_panel_of_a_job_looks_at_no_frame(blender, shot, tmp_path):
@@ -63,7 +71,7 @@ jobs.stop_current()
     assert looked == []
 
 
-SETTINGS = ["Preset", "Light Passes", "Noisy Frames", "Denoised Frames"]
+SETTINGS = ["Preset", "Light Passes", "Strength", "Noisy Frames", "Denoised Frames"]
 BUTTONS = ["Show", "Compare", "Add to Compositor"]
 
 

@@ -43,6 +43,29 @@ def test_they_are_the_frames_of_files(shot, tmp_path, options):
         assert result.plan.stages == files[number].plan.stages
 
 
+@pytest.mark.neural
+@pytest.mark.parametrize("strength", [0.0, 0.25])
+def test_a_share_of_the_noise_stays_in_all_layers(strength):
+    """Parts add up to the color as before, and what was not rendered is repaired all the same."""
+    pytest.importorskip("torch")
+    random = np.random.default_rng(1)
+    diffuse, glossy = random.gamma(2, 0.2, (2, 3, 32, 48, 3)).astype(np.float32)
+    alpha = random.uniform(0.2, 0.8, (3, 32, 48)).astype(np.float32)
+    frames = [
+        {"color": d + g, "diffuse": d, "glossy": g, "alpha": a} for d, g, a in zip(diffuse, glossy, alpha, strict=True)
+    ]
+    frames[1]["color"] = frames[1]["color"].copy()
+    frames[1]["color"][5, 6] = np.nan
+    whole, part = (
+        next(hybrid.denoise_arrays(frames, first_pass="nlm", preset="fast", numbers=[1], strength=share)).layers
+        for share in (1, strength)
+    )
+    for name in ("color", "diffuse", "glossy", "alpha"):
+        noisy = frames[1][name].reshape(whole[name].shape)
+        expected = np.where(np.isfinite(noisy), strength * whole[name] + (1 - strength) * noisy, whole[name])
+        np.testing.assert_allclose(part[name], expected, rtol=1e-5, atol=1e-6)
+
+
 def test_only_the_numbers_that_are_asked_for_are_denoised(shot):
     frames = [{"color": layers["color"]} for layers in layers_of(shot).values()]
     whole = {result.number: result.layers["color"] for result in hybrid.denoise_arrays(frames, preset="draft")}

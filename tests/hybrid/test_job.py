@@ -204,6 +204,8 @@ def test_a_callback_or_closing_ends_the_work_after_a_frame(tmp_path):
         ({"passes": 0}, "passes is 0, expected at least 1"),
         ({"precision": "float8"}, "expected one of auto, float32, bfloat16"),
         ({"aov_sum": "both"}, "expected one of layers, beauty"),
+        ({"strength": 1.5}, "strength is 1.5, expected 0 <= strength <= 1"),
+        ({"strength": 0.5, "passes": 2}, "expected --passes 1"),
         ({"stages": ["polish"]}, "stage is 'polish'"),
         ({"max_memory": "much"}, "max-memory is 'much'"),
         ({"preset": "draft", "breakdown": Path("b.png")}, "breakdown is of the network"),
