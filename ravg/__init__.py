@@ -5,6 +5,7 @@
 that ``import ravg`` is quick.
 """
 
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,9 @@ if TYPE_CHECKING:
     from hybrid.files.shots import open_shot
     from hybrid.job import DenoiseOptions, denoise_shot
 
-__all__ = ["DenoiseOptions", "check_packages", "denoise_arrays", "denoise_shot", "open_shot"]
+    __version__: str
+
+__all__ = ["DenoiseOptions", "__version__", "check_packages", "denoise_arrays", "denoise_shot", "open_shot"]
 
 
 def check_packages() -> None:
@@ -35,7 +38,13 @@ def check_packages() -> None:
             raise ImportError(f"ravg needs its own package {name}, expected {expected}, found {found}: {advice}")
 
 
+def __dir__() -> list[str]:
+    return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})
+
+
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return version("ravg")
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     check_packages()

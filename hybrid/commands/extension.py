@@ -14,18 +14,20 @@ import typer
 from hybrid.commands.options import command
 from hybrid.files.replace import replace_file
 
-ROOT = Path(__file__).parents[2]
 FILES = ("LICENSE", "NOTICE", "README.md", "pyproject.toml", "setup.cfg")  # for the wheel, beside its packages
 
 
 @command("blender-extension")
 def blender_extension(output: str) -> None:
     """Build the wheel, and write it with the extension's files."""
-    source = ROOT / "blender"
-    if not (source / "blender_manifest.toml").is_file():
-        raise FileNotFoundError(f"no folder {source}: the extension is made in a clone, after pip install -e .")
+    # An editable install is a clone itself; a regular one is used within a clone.
+    roots = Path(__file__).parents[2], Path()
+    clones = [root for root in roots if (root / "blender" / "blender_manifest.toml").is_file()]
+    if not clones:
+        raise FileNotFoundError(f"no folder blender in {Path.cwd()}: the extension is made in a clone of ravg")
+    source = clones[0] / "blender"
     with tempfile.TemporaryDirectory() as folder:
-        wheel = _build_wheel(Path(folder))
+        wheel = _build_wheel(clones[0], Path(folder))
         target = Path(output)
         if target.suffix != ".zip":
             target /= f"ravg-{wheel.name.split('-')[1]}.zip"
@@ -37,18 +39,18 @@ def blender_extension(output: str) -> None:
     typer.echo(f"{target}\nIn Blender: Edit > Preferences > Get Extensions > Install from Disk…")
 
 
-def _build_wheel(folder: Path) -> Path:
+def _build_wheel(clone: Path, folder: Path) -> Path:
     """Build the wheel from a copy of the packages, since building leaves files in its tree."""
     tree = folder / "tree"
     tree.mkdir()
     config = ConfigParser()
-    config.read(ROOT / "setup.cfg", encoding="utf-8")
+    config.read(clone / "setup.cfg", encoding="utf-8")
     packages = [name.rstrip("*") for name in config["options.packages.find"]["include"].split()]
     for name in (*FILES, *packages):
-        if (ROOT / name).is_dir():
-            shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
+        if (clone / name).is_dir():
+            shutil.copytree(clone / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
         else:
-            shutil.copyfile(ROOT / name, tree / name)
+            shutil.copyfile(clone / name, tree / name)
     words = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder)]
     if _has_setuptools():  # else pip downloads it
         words.append("--no-build-isolation")

@@ -38,7 +38,7 @@ def other(place: Path, name: str) -> Path:
 def test_ravg_exports_what_hybrid_does():
     assert ravg.open_shot is hybrid.open_shot
     assert ravg.denoise_shot is hybrid.denoise_shot
-    assert set(hybrid.__all__) == set(ravg.__all__) - {"check_packages"}
+    assert {*ravg.__all__} == {*hybrid.__all__, "__version__", "check_packages"}
     with pytest.raises(AttributeError, match="module 'ravg' has no attribute 'close_shot'"):
         ravg.close_shot  # noqa: B018
 
@@ -75,3 +75,9 @@ def test_packages_behind_ours_on_the_path_change_nothing(tmp_path):
         other(tmp_path, name)
     code = f"import sys; sys.path.append({str(tmp_path)!r}); import ravg; print(ravg.open_shot.__module__)"
     assert python(ROOT, "-c", code).stdout == "hybrid.files.shots\n"
+
+
+def test_its_names_and_version_are_those_of_a_package():
+    assert {*ravg.__all__} <= {*dir(ravg)}
+    assert not {name for name in dir(ravg) if not name.startswith("__")} - {*ravg.__all__}
+    assert ravg.__version__ == version("ravg")

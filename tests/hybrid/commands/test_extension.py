@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 import zipfile
+from pathlib import Path
 
 import pytest
 
@@ -13,7 +14,10 @@ from hybrid.commands import extension
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["", "made/mine.zip"])
-def test_the_extension_holds_its_files_and_the_wheel(tmp_path, capsys, name):
+def test_the_extension_holds_its_files_and_the_wheel(tmp_path, capsys, monkeypatch, name):
+    if name:  # as a regular install finds them
+        monkeypatch.setattr(extension, "__file__", str(tmp_path / "site-packages" / "hybrid" / "extension.py"))
+        monkeypatch.chdir(Path(__file__).parents[3])
     pytest.importorskip("setuptools", minversion="77", reason="builds the wheel: pip install setuptools>=77")
     assert main(["blender-extension", str(tmp_path / name)]) == 0
     (path,) = tmp_path.rglob("*.zip")
@@ -27,7 +31,8 @@ def test_the_extension_holds_its_files_and_the_wheel(tmp_path, capsys, name):
 
 
 def test_without_a_clone_the_error_says_so(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(extension, "ROOT", tmp_path)
+    monkeypatch.setattr(extension, "__file__", str(tmp_path / "site-packages" / "hybrid" / "extension.py"))
+    monkeypatch.chdir(tmp_path)
     assert main(["blender-extension", str(tmp_path)]) == 1
     assert "the extension is made in a clone" in capsys.readouterr().err
 
