@@ -1,6 +1,7 @@
 """`ravg inspect`: which layer has which role, and which stages run."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -73,6 +74,7 @@ def _inspect(read: ShotInput, rules: Rules, *, as_json: bool) -> None:
         typer.echo(json.dumps(document, indent=1))
         return
     console = Console()
+    console.print(_verdict(["files"] * len(shot.warnings) + [found.role for found in findings if found.warning]))
     console.print(f"{len(shot)} frames, {shot.numbers[0]}-{shot.numbers[-1]}, {width}×{height}", highlight=False)
     profile_line = f"profile: {printable(layers[0].profile)} ({printable(layers[0].reason)})\n"
     console.print(profile_line, highlight=False, markup=False)
@@ -90,6 +92,14 @@ def _inspect(read: ShotInput, rules: Rules, *, as_json: bool) -> None:
             ("on" if x.on else "off", x.stage, _measured(x), f"{x.reason} ({STAGES[x.stage]})") for x in plan.decisions
         ]
         print_table(("", "stage", "measured", "why"), rows, f"Plan{name}")
+
+
+def _verdict(roles: Sequence[str]) -> str:
+    """One line about the warnings, of which these are the roles."""
+    if not roles:
+        return "This shot is fine.\n"
+    found = "a warning says" if len(roles) == 1 else f"{len(roles)} warnings say"
+    return f"This shot could be better ({', '.join(dict.fromkeys(roles))}): {found} how.\n"
 
 
 def _measured(decision: Decision) -> str:

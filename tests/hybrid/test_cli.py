@@ -28,6 +28,8 @@ from tests.scenes import Scene
 
 ALL = {name: LazyCommand(name, entry).load() for name, entry in COMMANDS.items()}
 
+EXAMPLE = Path(__file__).parents[2] / "examples" / "shot" / "noisy.####.exr"
+
 
 def run(capsys, *arguments):
     code = main([str(argument) for argument in arguments])
@@ -161,6 +163,13 @@ def test_inspect_names_channels_and_decisions(shot_folder, capsys):
     assert code == 0
     for word in ("ViewLayer.Combined", "Vector", "demodulate", "refine", "off"):
         assert word in out
+
+
+def test_inspect_begins_with_a_verdict(shot_folder, capsys):
+    fine = run(capsys, "inspect", EXAMPLE, "--frames", "8-9")[1]
+    better = run(capsys, "inspect", shot_folder)[1]  # its normals and depth do not vary
+    assert fine.startswith("This shot is fine.\n")
+    assert better.startswith("This shot could be better (normal, depth): 2 warnings say how.\n")
 
 
 def test_denoise_writes_denoised_frames_that_keep_everything_else(tmp_path, capsys):
