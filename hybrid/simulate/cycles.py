@@ -11,6 +11,7 @@ import os
 import secrets
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -285,7 +286,18 @@ def main(job: dict[str, Any]) -> None:
             answer(file=path.name, samples=samples, seconds=round(time.perf_counter() - started, 3))
 
 
+def end_with_parent() -> None:
+    """End the process when its standard input is closed, as it is when the one that started it ends."""
+
+    def wait() -> None:
+        sys.stdin.buffer.read()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
 if __name__ == "__main__":
+    end_with_parent()
     main(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8")))
     sys.stderr.flush()
     os._exit(0)  # all is written; an orderly exit of Blender sometimes crashes

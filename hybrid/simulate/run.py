@@ -143,6 +143,7 @@ class _Worker:
         with answers.open("wb") as output, self._log.open("wb") as errors:
             self._process = subprocess.Popen(
                 [python, "-m", "hybrid.simulate.cycles", str(job)],
+                stdin=subprocess.PIPE,  # which closes however this process ends: the renderer ends then
                 stdout=output,
                 stderr=errors,
                 env={**os.environ, "PYTHONPATH": path},
@@ -159,12 +160,17 @@ class _Worker:
 
     def close(self) -> None:
         """Remove the process's files; raise SimulationError if it failed."""
-        self._answers.close()
+        self._close()
         lines = [line for line in self._log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
         self._folder.cleanup()
         if self._process.returncode != 0:
             last = lines[-1].strip() if lines else "no word"
             raise SimulationError(f"{self.out}: Blender ended with {self._process.returncode}: {last}")
+
+    def _close(self) -> None:
+        self._answers.close()
+        assert self._process.stdin is not None
+        self._process.stdin.close()
 
     def stop(self) -> None:
         """End the process and remove unfinished renders; finished ones stay."""
@@ -174,7 +180,7 @@ class _Worker:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        self._answers.close()
+        self._close()
         for partial in self.out.glob(f".{self._mark}-*"):
             partial.unlink()
         self._folder.cleanup()

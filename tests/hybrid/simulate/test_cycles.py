@@ -3,6 +3,8 @@
 import json
 import subprocess
 import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import OpenEXR
@@ -554,3 +556,26 @@ def test_a_random_shot_shows_something_and_is_the_same_twice(tmp_path):
     assert np.isfinite(once).all()
     assert (once.mean(axis=-1) > 0).mean() > 0.5
     assert once.std() > 0.05 * once.mean()
+
+
+@pytest.mark.posix
+def test_a_renderer_ends_with_the_process_that_started_it(scene, tmp_path):
+    """Killed, `ravg simulate` left it rendering for hours."""
+    words = [str(scene), "-o", str(tmp_path / "shot"), "--frames", "1-4", "--film", "64x36"]
+    words += ["--size", "64x36", "--levels", "s=65536", "--python", sys.executable]
+    run = subprocess.Popen([sys.executable, "-m", "hybrid.cli", "simulate", *words])
+    children = Path(f"/proc/{run.pid}/task/{run.pid}/children")
+    until(lambda: list((tmp_path / "shot").glob("meta.json")))  # it renders now
+    (renderer,) = (int(word) for word in children.read_text().split())
+    run.kill()
+    run.wait()
+    until(lambda: not Path(f"/proc/{renderer}").exists())
+
+
+def until(holds):
+    """Wait for a condition, a minute at most."""
+    for _ in range(600):
+        if holds():
+            return
+        time.sleep(0.1)
+    raise AssertionError("it did not come true in a minute")
