@@ -15,6 +15,7 @@ from torch.nn import functional
 
 from network.cpu.convolution import can_fuse, convolve
 from network.cpu.curve import decode, encode
+from network.cpu.fused_ops import can_project, convolve_to_rgb, halve, with_low_bits
 from network.cpu.upsample_conv import UpsampleTaps, can_upsample, convolve_upsampled, merge_taps
 from network.strips import in_strips
 from network.transfer import LARGEST, clip, srgb_forward, srgb_inverse
@@ -88,7 +89,7 @@ class OidnUNet(nn.Module):
         skips = []
         for stage in self.encoder[:-1]:
             skips.append(x)
-            (x,) = in_strips(lambda x, stage=stage: [functional.max_pool2d(stage(x), 2)], 2, x)
+            (x,) = in_strips(lambda x, stage=stage: [halve(stage(x))], 2, x)
         return self.encoder[-1](x), skips
 
     def decode(self, x: Tensor, skips: list[Tensor], head: Callable[[Tensor], Sequence[Tensor]]) -> list[Tensor]:
@@ -106,14 +107,13 @@ class OidnUNet(nn.Module):
     def input_skip(self, x: Tensor) -> Tensor:
         """Skip connection from the network's input; in bfloat16 with the low bits of the color (`round_unet`)."""
         if self.first.weight.dtype == torch.bfloat16:
-            if x.dtype == torch.bfloat16:
-                return x
-            rounded = x.to(torch.bfloat16, memory_format=torch.channels_last)
-            return torch.cat([rounded, (x[:, :3] - rounded[:, :3]).to(rounded.dtype)], 1)
+            return x if x.dtype == torch.bfloat16 else with_low_bits(x, 3)
         return x.to(self.first.weight.dtype, memory_format=torch.channels_last)
 
     def project(self, x: Tensor) -> Tensor:
         """Last convolution, from finest features to ``(N, 3, H, W)``; not rounded by any autocast."""
+        if can_project(x):
+            return convolve_to_rgb(x, self.last.weight, cast(Tensor, self.last.bias))
         with torch.autocast(x.device.type, enabled=False):
             return cast(Tensor, self.last(x.to(self.last.weight.dtype)))
 
@@ -133,6 +133,10 @@ class Stage(nn.Sequential):
         super().__init__(*layers)
         for name in UpsampleTaps._fields:
             self.register_buffer(name, None, persistent=False)
+
+    def after_first(self, x: Tensor) -> Tensor:
+        """Run all layers behind the first convolution and its ReLU."""
+        return self._run(x, list(self)[2:])
 
     def upsample(self, x: Tensor, skip: Tensor) -> Tensor:
         """Enlarge features to twice their size, concatenate the skip connection, and run all layers."""

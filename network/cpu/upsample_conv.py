@@ -4,13 +4,15 @@ In features enlarged by repetition, the nine taps of a pixel read only four diff
 value are added beforehand. That leaves four ninths of the work, and nothing is enlarged or concatenated.
 """
 
-from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
+from numba import njit
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from loops.parallel import run_bands
 from network.cpu.convolution import convolve
 from network.cpu.winograd import can_transform, convolve_transformed
 
@@ -46,12 +48,26 @@ def convolve_upsampled(x: Tensor, skip: Tensor, taps: UpsampleTaps, bias: Tensor
         parts = convolve_transformed(x, taps.coarse, None, relu=False)
     else:
         parts = functional.conv2d(x, taps.coarse, padding=1)
-    parts = parts.view(count, 2, 2, channels, height + 1, width + 1)
-    upsampled = x.new_empty(count, channels, 2 * height, 2 * width).to(memory_format=torch.channels_last)
-    for row, column in product(range(2), range(2)):
-        part = parts[:, row, column, :, row : row + height, column : column + width]
-        upsampled[..., row::2, column::2] = part
-    return convolve(skip, taps.skip, bias, upsampled)
+    parts = parts.permute(0, 2, 3, 1).contiguous()
+    upsampled = parts.new_empty(count, 2 * height, 2 * width, channels)
+    kind = torch.int16 if x.dtype == torch.bfloat16 else torch.int32
+    given = parts.view(kind).numpy().reshape(count, height + 1, width + 1, 2, 2, channels)
+    result = upsampled.view(kind).numpy().reshape(count, 2 * height, width, 2, channels)
+    for image, enlarged in zip(given, result, strict=True):
+        run_bands(_interleave, 2 * height, image, enlarged)
+    return convolve(skip, taps.skip, bias, upsampled.permute(0, 3, 1, 2))
+
+
+@njit(cache=True, nogil=True)
+def _interleave(first: int, last: int, parts: NDArray[Any], result: NDArray[Any]) -> None:
+    """Put the four parts of the pixels beside each other."""
+    _, width, _, channels = result.shape
+    for y in range(first, last):
+        i, row = y // 2, y % 2
+        for x in range(width):
+            for column in range(2):
+                for c in range(channels):
+                    result[y, x, column, c] = parts[i + row, x + column, row, column, c]
 
 
 def _halves(weight: Tensor, axis: int) -> tuple[Tensor, Tensor]:

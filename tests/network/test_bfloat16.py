@@ -36,6 +36,7 @@ def test_bfloat16_changes_little(name: str, monkeypatch: pytest.MonkeyPatch) -> 
     # Layer by layer, as each rounds what it is given.
     monkeypatch.setattr(convolution, "_FUSED", frozenset())
     monkeypatch.setattr(unet, "can_upsample", lambda *_: False)
+    monkeypatch.setattr(unet, "can_project", lambda _: False)
     plain = denoise(as_they_are(exact), *layers)
     monkeypatch.setattr(nn.Conv2d, "_conv_forward", convolve_exactly)
     emulated = denoise(round_unet(exact), *layers)
