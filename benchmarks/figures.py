@@ -1,0 +1,437 @@
+"""Make every table, chart and animation of README.md and docs/results.md from one revision.
+
+    python benchmarks/figures.py WORK [--parts ladder filters times pictures] [--scenes FOLDER] [--python FILE]
+    python benchmarks/figures.py WORK --write
+
+WORK/shots holds the shots of `LADDER`, one folder each; those that are not there are rendered by `ravg simulate`, the
+real scenes from the .blend files in FOLDER, with Blender's Python module in the interpreter FILE. Figures go to
+WORK/figures.json as they are measured, so that a run may be stopped and continued; those of another revision of the
+code are dropped. `--write` copies them to docs/figures.json, writes the blocks of the pages between
+``<!-- figures: NAME -->`` and ``<!-- end -->``, and draws the pictures. `tests/test_figures.py` compares the pages with
+the file.
+"""
+
+import argparse
+import hashlib
+import json
+import platform
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable
+from datetime import UTC, datetime
+from functools import partial
+from importlib.metadata import version
+from itertools import pairwise, product
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+import ladder
+from bench_shot import measure, write_shot
+
+from hybrid import open_shot
+from hybrid.files.exr import read_exr
+from hybrid.files.frame import Array
+from hybrid.files.movies import write_movie
+from hybrid.files.png import encode_bytes, write_png
+from tests.exr_files import write_layers
+
+ROOT = Path(__file__).resolve().parent.parent
+CODE = ("flow", "hybrid", "loops", "network", "nlm", "setup.cfg", "constraints.txt")
+PAGES = ("README.md", "docs/results.md")
+FIGURES = ROOT / "docs" / "figures.json"
+IMAGES = ROOT / "docs" / "images"
+MOVES = ("--camera", "random", "--moving-objects", "2")
+# Scene and options of each shot of the ladder.
+LADDER: dict[str, tuple[str, ...]] = {
+    "hard31001": ("hard", "--seed", "31001"),
+    "hard31002": ("hard", "--seed", "31002"),
+    "hard31004": ("hard", "--seed", "31004"),
+    "random31002": ("random", "--seed", "31002"),
+    "table": ("validation:table", "--seed", "1"),
+    "garden": ("validation:garden", "--seed", "1"),
+    "staircase": ("wooden_staircase.blend", *MOVES),
+    "classroom": ("classroom.blend", *MOVES),
+    "kitchen": ("country_kitchen.blend", *MOVES),
+    "chalice": ("chalice.blend", "--camera", "random", "--moving-objects", "1"),
+}
+RENDER = (
+    *("--film", "1920x1080", "--size", "192x108", "--frames", "1-7", "--levels", "s008=8,s032=32,s128=128,s512=512"),
+    *("--reference", "512", "--reference-frames", "3,4,5"),
+)
+SAMPLES = {"s008": 8, "s032": 32, "s128": 128, "s512": 512}
+NAMES = {
+    "noisy": "noisy",
+    "oidn-high": "OIDN high",
+    "oidn-best": "OIDN best",
+    "fast": "`fast`",
+    "balanced": "`balanced`",
+    "quality": "`quality`",
+}
+RIVALS = {"fast": "oidn-high", "balanced": "oidn-best", "quality": "oidn-best"}
+# Shots whose noise is correlated by the kernel [r 1 r] in both directions, at 32 samples.
+FILTERED = ("classroom", "staircase")
+RADII = (0.1, 0.2, 0.3, 0.45)
+LIGHT = ("Combined", "Denoising Albedo", "Denoising Normal")
+TIMED_FRAMES = 4
+Results = dict[str, Any]
+
+
+def state() -> str:
+    """Hash of the committed code that the figures depend on; exits where files of it are changed."""
+    changed = subprocess.check_output(["git", "status", "--porcelain", "--", *CODE], cwd=ROOT, text=True)
+    if changed:
+        raise SystemExit(f"figures: expected committed code, got changes in {changed.split()[1]}")
+    tree = subprocess.check_output(["git", "ls-tree", "HEAD", *CODE], cwd=ROOT)
+    return hashlib.sha256(tree).hexdigest()[:16]
+
+
+def processor() -> str:
+    """Name of the processor, and its instructions that matter for speed."""
+    info = Path("/proc/cpuinfo")
+    text = info.read_text(encoding="utf-8") if info.exists() else ""
+    name = re.search(r"model name\s*: (.*)", text)
+    best = next((word for word in ("amx_tile", "avx512_bf16", "avx512f", "avx2") if word in text), "")
+    return " ".join(part for part in (name[1] if name else platform.machine(), best.upper().replace("_", " ")) if part)
+
+
+def provenance() -> Results:
+    """Revision, date, processor and versions of a run."""
+    revision = subprocess.check_output(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, text=True).strip()
+    return {
+        "state": state(),
+        "version": version("ravg"),
+        "revision": revision,
+        "date": datetime.now(UTC).date().isoformat(),
+        "processor": processor(),
+        "libraries": {name: version(name) for name in ("torch", "pyoidn", "opencv-contrib-python-headless")},
+    }
+
+
+class Record:
+    """Figures by part and key, written to a file after each of them."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.values: Results = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+        if self.values.get("about", {}).get("state") != state():
+            self.values = {"about": provenance()}
+
+    def add(self, part: str, key: str, figures: Callable[[], list[float]]) -> None:
+        """Measure the figures of a key, unless they are there."""
+        if key not in self.values.setdefault(part, {}):
+            self.values[part][key] = figures()
+            self._path.write_text(json.dumps(self.values, indent=0), encoding="utf-8")
+            print(part, key, *self.values[part][key], flush=True)
+
+
+def find_shot(name: str, options: argparse.Namespace) -> Path:
+    """The folder of a shot of the ladder, rendered if it is not there."""
+    folder: Path = options.work / "shots" / name
+    if not any(folder.glob("reference_b.*.exr")):
+        scene, *words = LADDER[name]
+        if scene.endswith(".blend"):
+            if options.scenes is None:
+                raise SystemExit(f"figures: expected {folder}, or --scenes with {scene}, got neither")
+            scene = str(options.scenes / scene)
+        python = [] if options.python is None else ["--python", str(options.python)]
+        command = [sys.executable, "-m", "hybrid.cli", "simulate", scene, "-o", str(folder), *words, *RENDER, *python]
+        subprocess.run(command, check=True, cwd=ROOT)
+    return folder
+
+
+def judge(
+    record: Record, part: str, key: str, truth: ladder.Truth, level: str, methods: Iterable[str], **options: Any
+) -> None:
+    """Add PSNR and temporal PSNR of methods on a level of a shot."""
+    shot = truth.shot(level)
+    for method in methods:
+        record.add(part, f"{key} {method}", lambda m=method: truth.judge(shot, ladder.denoise(shot, m, **options)))
+
+
+def measure_ladder(record: Record, options: argparse.Namespace) -> None:
+    for name in LADDER:
+        truth = ladder.Truth(find_shot(name, options))
+        for level in SAMPLES:
+            judge(record, "ladder", f"{name} {level}", truth, level, NAMES)
+        judge(record, "given", name, truth, "s032", RIVALS, first_pass="oidn-best")  # as Blender's button starts
+
+
+def spread(folder: Path, out: Path, radius: float) -> None:
+    """Write the shot of a folder at 32 samples, and its references, as a pixel filter [r 1 r] shows them."""
+    kernel = np.array([radius, 1, radius], np.float32) / np.float32(1 + 2 * radius)
+    out.mkdir(parents=True, exist_ok=True)
+    for path in sorted([*folder.glob("s032.*.exr"), *folder.glob("reference_?.*.exr")]):
+        image = read_exr(path)
+        layers = {layer.name: image.pixels(layer.channels) for layer in image.layers}
+        for name, layer in layers.items():
+            if name.rpartition(".")[2] in LIGHT or len(layers) == 1:
+                layers[name] = cv2.sepFilter2D(layer, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)
+        write_layers(out / path.name, layers)
+
+
+def measure_filters(record: Record, options: argparse.Namespace) -> None:
+    for name, radius in product(FILTERED, RADII):
+        if f"{name} {radius} quality" not in record.values.get("filters", {}):
+            with tempfile.TemporaryDirectory() as folder:
+                spread(find_shot(name, options), Path(folder), radius)
+                judge(record, "filters", f"{name} {radius}", ladder.Truth(Path(folder)), "s032", NAMES)
+
+
+def measure_times(record: Record, options: argparse.Namespace) -> None:
+    """CPU seconds a frame and peak memory, GiB, of whole processes at 1920×1080."""
+    folder = options.work / "busy"
+    pattern = str(folder / "busy.####.exr")
+    if len(list(folder.glob("busy.*.exr"))) < TIMED_FRAMES:
+        write_shot("busy", folder, TIMED_FRAMES, 6)
+    bench = str(ROOT / "benchmarks" / "bench_shot.py")
+
+    def cost(method: str) -> list[float]:
+        with tempfile.TemporaryDirectory() as out:
+            words = [sys.executable, "-m", "hybrid.cli", "denoise", pattern, "-o", f"{out}/x", "--preset", method]
+            if method in ladder.OIDN:
+                words = [sys.executable, bench, "--run-oidn", pattern, out, method.removeprefix("oidn-")]
+            spent = measure(words)
+        return [round(spent["cpu_seconds"] / TIMED_FRAMES, 2), round(spent["peak_mib"] / 1024, 2)]
+
+    for method in (name for name in NAMES if name != "noisy"):
+        record.add("times", method, partial(cost, method))
+
+
+# Tables, as Markdown of the figures.
+
+
+def _pair(figures: Iterable[float], digits: int = 1, *, signed: bool = False) -> str:
+    """PSNR / temporal PSNR; without a sign on 0."""
+    words = [f"{value:{'+' if signed else ''}.{digits}f}" for value in figures]
+    return " / ".join(re.sub(r"^[+-](0\.0+)$", r"\1", word).replace("-", "−") for word in words)
+
+
+def _rows(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    lines = [list(head), *map(list, rows)]
+    lines.insert(1, ["---"] * len(lines[0]))
+    return "\n".join(
+        f"| {' | '.join(line)} |" if index != 1 else f"|{'|'.join(line)}|" for index, line in enumerate(lines)
+    )
+
+
+def _of(results: Results, level: str, method: str) -> dict[str, list[float]]:
+    """Figures of each shot at a level."""
+    found = {name: results["ladder"].get(f"{name} {level} {method}") for name in LADDER}
+    return {name: figures for name, figures in found.items() if figures}
+
+
+def _mean(figures: dict[str, list[float]]) -> list[float]:
+    return [float(np.mean(column)) for column in zip(*figures.values(), strict=True)]
+
+
+def _gains(results: Results, level: str, method: str) -> dict[str, list[float]]:
+    """Gains of a preset over its rival on each shot."""
+    rival = _of(results, level, RIVALS[method])
+    return {n: [a - b for a, b in zip(v, rival[n], strict=True)] for n, v in _of(results, level, method).items()}
+
+
+def _worst(gains: dict[str, list[float]]) -> tuple[str, list[float]]:
+    name = min(gains, key=lambda name: gains[name][0])
+    return name, gains[name]
+
+
+def _cost(results: Results, method: str) -> tuple[str, str]:
+    seconds, memory = results["times"].get(method, (None, None))
+    return ("–", "–") if seconds is None else (f"{seconds:.1f} s", f"{memory:.1f} GiB")
+
+
+def summary(results: Results) -> str:
+    """README: accuracy and stability at 32 samples, time and memory."""
+    worst, _ = _worst(_gains(results, "s032", "quality"))
+    rows = [
+        [
+            NAMES[method] + {"balanced": " (default)", "oidn-best": ", Blender's default"}.get(method, ""),
+            _pair(_mean(_of(results, "s032", method))),
+            _pair(_of(results, "s032", method)[worst]),
+            *_cost(results, method),
+        ]
+        for method in NAMES
+    ]
+    return _rows(("method", "mean", f"worst shot (*{worst}*)", "CPU time", "memory"), rows)
+
+
+def samples(results: Results) -> str:
+    """Results: means at each number of samples, and the worst shot of each preset."""
+    rows = [[NAMES[method], *(_pair(_mean(_of(results, level, method)), 2) for level in SAMPLES)] for method in NAMES]
+    for method, rival in RIVALS.items():
+        worst = [_worst(_gains(results, level, method)) for level in SAMPLES]
+        rows.append(
+            [
+                f"worst of {NAMES[method]} over {NAMES[rival]}",
+                *(f"{_pair(gain, signed=True)} *{name}*" for name, gain in worst),
+            ]
+        )
+    return _rows(("samples per pixel", *map(str, SAMPLES.values())), rows)
+
+
+def shots(results: Results) -> str:
+    """Results: each shot at 32 samples."""
+    return _rows(
+        ("", *LADDER),
+        ([NAMES[method], *(_pair(figures) for figures in _of(results, "s032", method).values())] for method in NAMES),
+    )
+
+
+def given(results: Results) -> str:
+    """Results: presets on OIDN best's own frames, over these frames."""
+    rows = []
+    for method in RIVALS:
+        best = _of(results, "s032", "oidn-best")
+        gains = {n: [a - b for a, b in zip(results["given"][f"{n} {method}"], best[n], strict=True)] for n in best}
+        name, worst = _worst(gains)
+        rows.append([NAMES[method], _pair(_mean(gains), signed=True), f"{_pair(worst, signed=True)} *{name}*"])
+    return _rows(("preset", "mean gain", "worst shot"), rows)
+
+
+def filters(results: Results) -> str:
+    """Results: shots whose pixels share noise."""
+    rows = [
+        [f"*{name}*, r = {radius}", *(_pair(results["filters"][f"{name} {radius} {method}"]) for method in NAMES)]
+        for name in FILTERED
+        for radius in RADII
+    ]
+    return _rows(("shot", *NAMES.values()), rows)
+
+
+def times(results: Results) -> str:
+    """Results: CPU time and memory of whole processes."""
+    high, best = (results["times"][f"oidn-{mode}"][0] for mode in ("high", "best"))
+    rows = []
+    for method, (seconds, _) in results["times"].items():
+        rows.append([NAMES[method], *_cost(results, method), f"{seconds / high:.2f}", f"{seconds / best:.2f}"])
+    return _rows(("method", "CPU time a frame", "peak memory", "of OIDN high", "of OIDN best"), rows)
+
+
+BLOCKS = {"summary": summary, "samples": samples, "shots": shots, "given": given, "filters": filters, "times": times}
+
+
+def origin(about: Results) -> str:
+    """The line under each block."""
+    libraries = ", ".join(f"{name} {number}" for name, number in about["libraries"].items())
+    return (
+        f"*ravg {about['version']}, revision {about['revision']}, {about['date']}, {about['processor']}, {libraries}.*"
+    )
+
+
+def fill(text: str, results: Results) -> str:
+    """A page with its blocks written anew."""
+
+    def block(match: re.Match[str]) -> str:
+        table = BLOCKS[match["name"]](results)
+        return f"<!-- figures: {match['name']} -->\n{table}\n\n{origin(results['about'])}\n<!-- end -->"
+
+    return re.sub(r"<!-- figures: (?P<name>\w+) -->\n.*?<!-- end -->", block, text, flags=re.DOTALL)
+
+
+# Pictures.
+
+
+def _label(image: Array, text: str) -> Array:
+    for thickness, gray in ((3, 0), (1, 255)):  # white on black is readable on any picture
+        cv2.putText(image, text, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (gray,) * 3, thickness, cv2.LINE_AA)
+    return image
+
+
+def _beside(images: dict[str, Array], scale: int, middle: float) -> Array:
+    """Labelled images side by side, enlarged by whole pixels; `middle` is shown at 0.18 in linear light."""
+    shown = {
+        name: encode_bytes(np.repeat(np.repeat(image, scale, 0), scale, 1) * np.float32(0.18 / middle))
+        for name, image in images.items()
+    }
+    return np.concatenate(
+        [_label(np.ascontiguousarray(image), NAMES.get(n, n).strip("`")) for n, image in shown.items()], 1
+    )
+
+
+def draw_motion(options: argparse.Namespace) -> None:
+    """README: seven frames of *kitchen* at 8 samples as they play."""
+    shot = open_shot(f"{find_shot('kitchen', options)}/s008.####.exr")
+    images = {method: ladder.denoise(shot, method) for method in ("noisy", "oidn-best", "balanced")}
+    middle = float(np.mean(images["oidn-best"][0]))
+    frames = [_beside({m: row[i] for m, row in images.items()}, 2, middle) for i in range(len(shot.numbers))]
+    write_movie(IMAGES / "motion.webp", iter([*frames, *frames[-2:0:-1]]), 8.0)
+
+
+def draw_flicker(options: argparse.Namespace) -> None:
+    """Results: twenty-five times the difference of two frames after motion compensation, of *kitchen*, 32 samples."""
+    truth = ladder.Truth(find_shot("kitchen", options))
+    shot = truth.shot("s032")
+    frames = [shot.read(number) for number in shot.numbers]
+    (flow, valid), *_ = (ladder.motion_between(*pair) for pair in pairwise(frames))
+    y, x = np.mgrid[: flow.shape[0], : flow.shape[1]].astype(np.float32)
+    images = {}
+    for method in ("oidn-high", "oidn-best", "balanced", "quality"):
+        first, second, *_ = ladder.denoise(shot, method)
+        light = float(np.mean(first))
+        curves = [image / (image + np.float32(light)) for image in (first, second)]
+        moved = cv2.remap(
+            curves[1], x + flow[..., 0], y + flow[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+        )
+        images[method] = np.clip(0.214 + 25 * 0.214 * (moved - curves[0]) * valid[..., None], 0, 1)
+    write_png(IMAGES / "flicker.png", _beside(images, 2, 0.18) / 255)
+
+
+def draw_filter(options: argparse.Namespace) -> None:
+    """README: *classroom* with the filter r = 0.3, 32 samples."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        spread(find_shot("classroom", options), folder, 0.3)
+        truth = ladder.Truth(folder)
+        shot = truth.shot("s032")
+        images = {method: ladder.denoise(shot, method)[1] for method in ("noisy", "oidn-best", "balanced")}
+        images["1024 samples"] = sum(truth.references[1]) / np.float32(2)
+        write_png(IMAGES / "filter.png", _beside(images, 2, float(np.mean(images["1024 samples"]))) / 255)
+
+
+PICTURES = {"motion.webp": draw_motion, "flicker.png": draw_flicker, "filter.png": draw_filter}
+
+
+def write(record: Record, options: argparse.Namespace) -> None:
+    """Write the file of figures, the blocks of the pages and the pictures."""
+    ladder.draw(record.values["ladder"], IMAGES / "ladder.png")
+    for draw in PICTURES.values():
+        draw(options)
+    names = ("ladder.png", *PICTURES)
+    hashes = {name: hashlib.sha256((IMAGES / name).read_bytes()).hexdigest() for name in names}
+    results = record.values | {"pictures": hashes}
+    FIGURES.write_text(json.dumps(results, indent=0) + "\n", encoding="utf-8")
+    for page in PAGES:
+        path = ROOT / page
+        path.write_text(fill(path.read_text(encoding="utf-8"), results), encoding="utf-8")
+
+
+PARTS = {"ladder": measure_ladder, "filters": measure_filters, "times": measure_times}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("work", type=Path, help="folder of shots and of figures.json")
+    parser.add_argument("--parts", nargs="*", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--scenes", type=Path, metavar="FOLDER", help="real scenes as .blend files")
+    parser.add_argument("--python", type=Path, metavar="FILE", help="Python interpreter with bpy")
+    parser.add_argument("--write", action="store_true", help="write pages and pictures")
+    options = parser.parse_args()
+    options.work.mkdir(parents=True, exist_ok=True)
+    record = Record(options.work / "figures.json")
+    for part in options.parts:
+        PARTS[part](record, options)
+    if options.write:
+        write(record, options)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
