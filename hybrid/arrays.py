@@ -1,13 +1,19 @@
 """Denoise frames in memory, without files."""
 
+from __future__ import annotations  # `help` then shows the names of types, not what they stand for
+
+import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from numbers import Integral
 from typing import Self, cast
 
 import numpy as np
 
+from flow.convention import choose_convention
 from flow.motion import MotionConvention
+from flow.patches import FramePair, Patches
 from hybrid.files.frame import Array, Frame
 from hybrid.files.passes import BEAUTY, NO_PASSES
 from hybrid.files.profile import parse_motion
@@ -22,6 +28,7 @@ from hybrid.stream import FrameStream
 Layers = Sequence[Mapping[str, Array]] | Mapping[int, Mapping[str, Array]]  # layers of each frame, by index or number
 # Names of layers that are no AOVs.
 LAYERS = ("color", "albedo", "normal", "depth", "motion", "variance", "alpha", "estimate")
+ALIKE = 0.8  # similarity by `difflib` from which on a name is a known one with a slip: "albdeo" has 0.83, "diffuse" 0.3
 
 
 class ArrayFrames:
@@ -38,7 +45,7 @@ class ArrayFrames:
             raise ValueError(f"motion is {motion!r}, expected a convention such as 'next,pixels,y-down'")
         self.passes = NO_PASSES
         self._frames = frames
-        self._convention = None if motion is None else MotionConvention(**parse_motion(motion))
+        self.convention = None if motion is None else MotionConvention(**parse_motion(motion))
         first = self.read(self.numbers[0])
         self.aovs, self.shape = tuple(first.aovs), first.color.shape[:2]
         if self.aovs:
@@ -63,17 +70,27 @@ class ArrayFrames:
     def read(self, number: int) -> Frame:
         """A frame; ValueError where a layer does not fit the others."""
         layers = self._arrays(number)
+        for name in layers:
+            if name not in LAYERS and (near := get_close_matches(str(name).lower(), LAYERS, 1, ALIKE)):
+                raise ValueError(f"frame {number}: layer {name!r} is unknown, expected {near[0]}? (or an AOV's name)")
         if "color" not in layers:
             raise ValueError(f"frame {number}: expected the layer color, got {', '.join(layers) or 'none'}")
-        if ("motion" in layers) and self._convention is None:
-            raise ValueError(f"frame {number} has the layer motion, expected its convention as `motion`")
-        frame = Frame(
-            number,
-            **{name: layers[name] for name in LAYERS if name in layers},  # type: ignore[arg-type]
-            motion_convention=self._convention if "motion" in layers else None,
-            aovs={name: _as_aov(layers[name]) for name in layers if name not in (*LAYERS, *self.passes.kept)},
-            passes=self.passes,
-        )
+        if "motion" in layers:
+            if self.convention is None:
+                raise ValueError(f"frame {number} has the layer motion, expected its convention as `motion`")
+            got, expected = layers["motion"].shape, (*layers["color"].shape[:2], self.convention.channels)
+            if got != expected:
+                raise ValueError(f"frame {number}: motion is {got}, expected {expected} for {self.convention}")
+        try:
+            frame = Frame(
+                number,
+                **{name: layers[name] for name in LAYERS if name in layers},  # type: ignore[arg-type]
+                motion_convention=self.convention if "motion" in layers else None,
+                aovs={name: _as_aov(layers[name]) for name in layers if name not in (*LAYERS, *self.passes.kept)},
+                passes=self.passes,
+            )
+        except ValueError as error:
+            raise ValueError(f"frame {number}: {error}") from None
         if frame.color.size == 0:
             raise ValueError(f"frame {number} has shape {frame.color.shape[:2]}, expected at least one pixel")
         if number != self.numbers[0] and frame.color.shape[:2] != self.shape:
@@ -87,14 +104,43 @@ class ArrayFrames:
             raise ValueError(f"frame {number} is a {type(layers).__name__}, expected names of layers and their arrays")
         found = {name: np.asarray(layer) for name, layer in layers.items()}
         for name, layer in found.items():
-            if layer.dtype.kind not in "buif":
-                raise ValueError(f"frame {number}: {name} has type {layer.dtype}, expected real numbers")
+            if layer.dtype.kind != "f":
+                expected = "float radiance, scene-linear" if name in ("color", "estimate") else "float"
+                raise ValueError(f"frame {number}: {name} has type {layer.dtype}, expected {expected}")
         return {name: np.asarray(layer, np.float32) for name, layer in found.items()}
 
 
 def _as_aov(layer: Array) -> Array:
     """A layer (H, W, C), also of (H, W)."""
     return layer if layer.ndim == 3 else layer[..., None]
+
+
+def _doubt_vectors(shot: ArrayFrames, number: int) -> str | None:
+    """Report if a frame and the next, or else the one before, match along the vectors in no sign; None if they do."""
+    starts = [n for n in (number, number - shot.step) if shot.has(n) and shot.has(n + shot.step)]
+    if shot.convention is None or not starts:
+        return None
+    earlier, later = shot.read(starts[0]), shot.read(starts[0] + shot.step)
+    if earlier.motion is None or later.motion is None:
+        return None
+    vectors = earlier.motion, later.motion
+
+    def patches(*roles: str) -> list[Patches]:
+        layers = [(getattr(earlier, role), getattr(later, role), role) for role in roles]
+        return [
+            Patches(FramePair(here, there, *vectors, shot.shape, shot.step, float(role == "normal")))
+            for here, there, role in layers
+            if here is not None and there is not None
+        ]
+
+    choice = choose_convention(patches("color"), shot.convention, surfaces=lambda: patches("albedo", "normal"))
+    if choice.convention == shot.convention:
+        return None
+    pair = f"motion: frames {earlier.number} and {later.number} match"
+    if choice.convention is not None:
+        return f"{pair} along {choice.convention}, not along {shot.convention}; expected the former as `motion`"
+    left, still = f"{choice.unexplained:.1%}", f"{choice.still:.1%}"
+    return f"{pair} along the vectors in no sign or unit (the best leaves {left}, no motion {still}); check the vectors"
 
 
 @dataclass(frozen=True)
@@ -117,21 +163,26 @@ def denoise_arrays(
 ) -> Iterator[ArrayResult]:
     """Denoise frames in memory.
 
-    The pixels are those that `hybrid.denoise_shot` computes from the same layers; layers are not validated. AOVs that
-    add up to the color are scaled to do so again. At most a window of frames is held.
+    The pixels are those that `hybrid.denoise_shot` computes from the same layers. AOVs that add up to the color are
+    scaled to do so again. At most a window of frames is held. Options are checked at once; frames are denoised, and
+    their layers checked, while the iterator is consumed.
 
     Parameters
     ----------
     frames : sequence or mapping of int to mapping of str to array
         Layers of each frame, all of one size: "color" (H, W, 3), linear radiance; optional "albedo", "normal",
         "variance" of the color's mean, "estimate", an image denoised already, (H, W, 3) each; "depth", "alpha" (H, W);
-        "motion" (H, W, 2 or 4). Any other name is an AOV (H, W, C), which a network denoises along, as the alpha. Keys
-        of a mapping are frame numbers, and its frames may be computed when they are looked up.
-    options : DenoiseOptions, optional, what is asked for; options about files, passes and memory are refused
+        "motion" (H, W, C) with the channels of its convention. Any other name is an AOV (H, W, C), which a network
+        denoises along, as the alpha. All are of a float type. Keys of a mapping are frame numbers, and its frames may
+        be computed when they are looked up.
+    options : DenoiseOptions, optional
+        All but those of files, passes and memory: `budget`, `keep_first_pass`, `passes`, `breakdown`, `max_memory`,
+        `resume`, `keep_going` and `strict` must be as by default.
     motion : str, optional
-        Convention of the vectors in words of ``ravg --motion`` (docs/renderers.md), such as "next,pixels,y-down".
+        Convention of the vectors in words of ``ravg --motion`` (docs/renderers.md), such as "next,pixels,y-down";
+        needed with the layer "motion".
     numbers : collection of int, optional
-        Frames to denoise; all without. The others are neighbours.
+        Frames to denoise; default: all. The others are neighbours.
     progress : callable, optional, called with each result; if it returns False, the work ends there
     **changes : object, fields of `DenoiseOptions`, in place of those of `options`
 
@@ -146,12 +197,17 @@ def denoise_arrays(
     ImportError
         If OIDN is asked for and pyoidn is not installed.
 
+    Warns
+    -----
+    UserWarning
+        If two frames do not match along the vectors (once), or if no pixel of a frame is finite.
+
     Examples
     --------
     >>> import numpy as np
     >>> from hybrid import denoise_arrays
     >>> noisy = [{"color": np.random.default_rng(n).gamma(4, 0.25, (32, 48, 3))} for n in range(3)]
-    >>> [result.layers["color"].shape for result in denoise_arrays(noisy, preset="draft")]
+    >>> [result.layers["color"].shape for result in denoise_arrays(noisy)]
     [(32, 48, 3), (32, 48, 3), (32, 48, 3)]
     """
     chosen = replace_options(options, changes)
@@ -179,8 +235,12 @@ def denoise_arrays(
             shot, chosen.rules, source.first_pass, radius=denoiser.radius, filter_guides=denoiser.filter_guides
         )
         denoise = FrameDenoiser(stream, denoiser, strength=chosen.strength)
+        if wanted and (doubt := _doubt_vectors(shot, wanted[0])) is not None:
+            warnings.warn(doubt, stacklevel=2)
         for number in wanted:
             made = denoise.make(number)
+            if made.repaired == np.prod(shot.shape):
+                warnings.warn(f"frame {number}: no pixel of color is finite; expected a rendered frame", stacklevel=2)
             layers = {"color": made.denoised.color, **made.denoised.aovs, **shot.kept(number)}
             result = ArrayResult(number, layers, made.plan)
             yield result

@@ -1,5 +1,7 @@
 """One description of what is asked for and one way to run it: command, Python, chunks on a cluster, ``--resume``."""
 
+from __future__ import annotations  # `help` then shows the names of types, not what they stand for
+
 import hashlib
 import json
 import logging
@@ -64,7 +66,9 @@ MEASURED = tuple(reversed(NETWORKS))  # presets that a budget chooses from, the 
 
 @dataclass(frozen=True)
 class DenoiseOptions:
-    """Everything that is asked for when a shot is denoised, validated before any file is opened.
+    """The options of `denoise_shot` and `denoise_arrays`, with the names of ``ravg denoise``.
+
+    They are validated before any file is opened.
 
     Raises
     ------
@@ -216,18 +220,21 @@ def _describe_others() -> str:
     for name, hint in get_type_hints(DenoiseOptions).items():
         if name in texts and f" {name} : " not in str(DenoiseOptions.__doc__):
             chosen = ", ".join(map(repr, get_args(hint))) if get_origin(hint) is Literal else ""
-            lines += [f"    {name} : {chosen or getattr(hint, '__name__', hint)}", f"        {texts[name]['help']}"]
-    return "\n".join([*lines, "    "])
+            kind = hint.__name__ if isinstance(hint, type) else str(hint).replace("pathlib.", "")
+            lines += [f"    {name} : {chosen or kind}", f"        {texts[name]['help']}"]
+    return "\n".join([*lines, ""])
 
 
 if DenoiseOptions.__doc__:  # none with python -OO
-    DenoiseOptions.__doc__ = DenoiseOptions.__doc__.rstrip() + "\n" + _describe_others()
+    first = "----------\n    stages"
+    others = first.replace("    stages", f"{_describe_others()}    stages")
+    DenoiseOptions.__doc__ = DenoiseOptions.__doc__.replace(first, others)
 
 
 def replace_options(options: DenoiseOptions | None, changes: Mapping[str, object]) -> DenoiseOptions:
     """Return options, or the defaults, with some fields replaced; ValueError for a field that does not exist."""
     if not (options is None or isinstance(options, DenoiseOptions)):
-        raise ValueError(f"options is {options!r}, expected DenoiseOptions, or keywords such as preset='draft'")
+        raise ValueError(f"options is {options!r}, expected DenoiseOptions, or keywords such as preset='fast'")
     given = dict(changes)
     if "estimate" in given:  # the old name
         warnings.warn("estimate is now first_pass, and goes in the next release", DeprecationWarning, stacklevel=3)
@@ -622,7 +629,7 @@ def denoise_shot(
     --------
     >>> from hybrid import denoise_shot, open_shot
     >>> shot = open_shot("examples/shot/noisy.####.exr", frames="8-10")
-    >>> [frame.path.name for frame in denoise_shot(shot, "out/denoised.####.exr", preset="draft")]
+    >>> [frame.path.name for frame in denoise_shot(shot, "out/denoised.####.exr")]
     ['denoised.0008.exr', 'denoised.0009.exr', 'denoised.0010.exr']
     """
     if not isinstance(shot, Shot):

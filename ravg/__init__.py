@@ -1,8 +1,16 @@
 """Denoise rendered animation from other programs.
 
-`open_shot` finds the frames of a shot, `denoise_shot` denoises and writes them, as `DenoiseOptions` say;
-`denoise_arrays` denoises arrays without files. All are those of `hybrid`, and are imported when they are first used, so
-that ``import ravg`` is quick.
+`open_shot` finds the frames of a shot: names of layers, conventions and a range are its arguments. `denoise_shot`
+denoises and writes them, as ``ravg denoise`` does. `denoise_arrays` denoises numpy arrays, without files. The options
+of both are keywords, or a `DenoiseOptions`.
+
+    from ravg import denoise_shot, open_shot
+
+    shot = open_shot("noisy.####.exr", frames="1001-1010")
+    for frame in denoise_shot(shot, "out/denoised.####.exr", preset="quality"):
+        print(frame.number, frame.path)
+
+These names are imported when they are first used, so that ``import ravg`` is quick.
 """
 
 from importlib.metadata import version

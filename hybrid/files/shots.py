@@ -1,5 +1,7 @@
 """Shots: numbered EXR files, read lazily, a window of neighbouring frames at a time."""
 
+from __future__ import annotations  # `help` then shows the names of types, not what they stand for
+
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress

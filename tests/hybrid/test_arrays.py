@@ -1,7 +1,9 @@
 """Frames in memory are denoised as those of files."""
 
 import doctest
+import warnings
 
+import cv2
 import numpy as np
 import pytest
 
@@ -110,8 +112,27 @@ def test_a_network_takes_a_first_pass_and_aovs_from_memory(shot):
         ([{"color": np.ones((4, 4, 3))}], {"numbers": [3]}, "frame 3 is not there"),
         ([{"color": np.ones((4, 4, 3))}], {"numbers": 0}, "numbers is 0, expected a list"),
         ([{"color": np.ones((4, 4, 3))}], {"motion": "none"}, "expected a convention"),
-        ([{"color": np.ones((4, 4, 3)), "Albedo": np.ones((4, 4, 3))}], {}, "'Albedo' is an AOV, expected none"),
-        ([{"color": np.ones((4, 4, 3), complex)}], {}, "color has type complex128, expected real numbers"),
+        ([{"color": np.ones((4, 4, 3)), "glow": np.ones((4, 4, 3))}], {}, "'glow' is an AOV, expected none"),
+        (
+            [{"color": np.ones((4, 4, 3)), "Albedo": np.ones((4, 4, 3))}],
+            {},
+            "layer 'Albedo' is unknown, expected albedo",
+        ),
+        (
+            [{"color": np.ones((4, 4, 3)), "albdeo": np.ones((4, 4, 3))}],
+            {},
+            "layer 'albdeo' is unknown, expected albedo",
+        ),
+        ([{"colour": np.ones((4, 4, 3))}], {}, "layer 'colour' is unknown, expected color"),
+        ([{"color": np.ones((4, 4, 3), complex)}], {}, "color has type complex128, expected float radiance"),
+        ([{"color": np.ones((4, 4, 3), np.uint8)}], {}, "color has type uint8, expected float radiance"),
+        ([{"color": np.ones((4, 4, 3)), "depth": np.ones((4, 4), int)}], {}, "depth has type int64, expected float"),
+        ([{"color": np.ones((4, 4, 3)), "depth": np.ones((4, 5))}], {}, r"frame 0: depth is float32 \(4, 5\)"),
+        (
+            [{"color": np.ones((4, 4, 3)), "motion": np.ones((4, 4, 3))}],
+            {"motion": "next,pixels,y-down"},
+            r"frame 0: motion is \(4, 4, 3\), expected \(4, 4, 2\) for next,pixels,y-down",
+        ),
         ([{"color": np.ones((0, 4, 3))}], {}, "expected at least one pixel"),
         ([np.ones((4, 4, 3))], {}, "frame 0 is a ndarray, expected names of layers"),
         ({"color": np.ones((4, 4, 3))}, {}, "a mapping of numbers to frames"),
@@ -143,12 +164,47 @@ def test_light_passes_add_up_to_the_color_as_those_of_files():
         np.testing.assert_array_equal(layers["mask"], frames[0]["mask"][..., None])  # without noise: not denoised
 
 
+def moving(vector):
+    """Three frames of a picture that moves by 3 pixels to the right, with this vector everywhere."""
+    noise = np.random.default_rng(0).gamma(1, 1, (64, 110, 3)).astype(np.float32)
+    picture = cv2.GaussianBlur(noise, (0, 0), 1.5)
+    vectors = np.zeros((64, 96, 2), np.float32) + np.float32(vector)
+    return [{"color": picture[:, 10 - 3 * n : 106 - 3 * n], "motion": vectors} for n in range(3)]
+
+
+@pytest.mark.parametrize(
+    ("vector", "words"),
+    [
+        ((3, 0), None),
+        ((-3, 0), "frames 0 and 1 match along previous,pixels,y-down, not along next,pixels,y-down"),
+        ((6, 6), "frames 0 and 1 match along the vectors in no sign or unit"),
+    ],
+)
+def test_vectors_along_which_frames_do_not_match_are_reported_once(vector, words):
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        assert len(list(hybrid.denoise_arrays(moving(vector), motion="next,pixels,y-down", preset="draft"))) == 3
+    assert len(found) == (words is not None)
+    assert all(words in str(warning.message) and warning.filename == __file__ for warning in found)
+
+
+def test_a_frame_without_a_finite_pixel_is_reported():
+    frames = {number: {"color": np.ones((16, 24, 3))} for number in (4, 5, 6)}
+    frames[4]["color"][3:] = np.nan
+    frames[5]["color"][:] = np.nan
+    with pytest.warns(UserWarning, match="frame 5: no pixel of color is finite") as found:
+        list(hybrid.denoise_arrays(frames, preset="draft"))
+    assert len(found) == 1
+
+
 def test_frames_of_another_size_are_refused():
     frames = [{"color": np.ones((8, 8, 3))}, {"color": np.ones((8, 9, 3))}]
     with pytest.raises(ValueError, match=r"frame 1 has shape \(8, 9\), expected \(8, 8\)"):
         list(hybrid.denoise_arrays(frames, preset="draft"))
 
 
+@pytest.mark.neural
 def test_the_example_runs():
+    pytest.importorskip("torch")
     tried = doctest.testmod(arrays)
     assert (tried.attempted, tried.failed) == (4, 0)

@@ -248,10 +248,12 @@ def test_every_page_is_in_the_index():
     assert {page for page in PAGES if page not in (ROOT / "README.md", ROOT / "docs" / "README.md")} <= linked
 
 
+@pytest.mark.neural
 @pytest.mark.posix
 @pytest.mark.usefixtures("folder")
 @pytest.mark.parametrize("index", [0, 1])
 def test_python_of_the_documentation_runs(index, capsys):
+    pytest.importorskip("torch")
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(encoding="utf-8"), re.DOTALL)
     assert len(blocks) == 2
     exec(compile(blocks[index], "python.md", "exec"), {})

@@ -80,8 +80,10 @@ def test_it_resumes_with_the_same_weights_alone(shot_folder, tmp_path):
     assert resumed(shot_folder, tmp_path / "out", aovs=("ViewLayer.Denoising Albedo",), **more) == [False] * 3
 
 
+@pytest.mark.neural
 @pytest.mark.posix
 def test_the_example_runs(tmp_path, monkeypatch):
+    pytest.importorskip("torch")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     tried = doctest.testmod(job)

@@ -1,8 +1,11 @@
 """The package `ravg` and its command, in processes of their own."""
 
 import os
+import pydoc
+import re
 import subprocess
 import sys
+from dataclasses import fields
 from importlib.metadata import version
 from pathlib import Path
 
@@ -81,3 +84,12 @@ def test_its_names_and_version_are_those_of_a_package():
     assert {*ravg.__all__} <= {*dir(ravg)}
     assert not {name for name in dir(ravg) if not name.startswith("__")} - {*ravg.__all__}
     assert ravg.__version__ == version("ravg")
+
+
+def test_help_names_types_and_lists_the_options_in_order():
+    said = pydoc.render_doc(ravg, renderer=pydoc.plaintext)
+    assert "    denoise_arrays(frames: 'Layers', options: 'DenoiseOptions | None' = None," in said
+    assert "    open_shot(spec: 'str | Path'," in said
+    attributes = re.findall(r"^     \|  (\w+) : ", said, re.MULTILINE)
+    assert attributes[:3] == ["method", "preset", "budget"]
+    assert sorted(attributes) == sorted(field.name for field in fields(ravg.DenoiseOptions))
