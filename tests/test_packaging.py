@@ -167,14 +167,5 @@ def test_versions_are_the_same_everywhere():
     manifest = (ROOT / "blender" / "blender_manifest.toml").read_text(encoding="utf-8")
     assert f'\nversion = "{VERSION}"\n' in manifest
     assert f"\nversion: {VERSION}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
-    assert f'version = "{VERSION}"' in (ROOT / "packaging" / "conda" / "meta.yaml").read_text(encoding="utf-8")
     assert f"\n## {VERSION}" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert f"`ravg-{VERSION}.zip`" in (ROOT / "docs" / "blender.md").read_text(encoding="utf-8")
-
-
-def test_the_recipe_for_conda_asks_for_the_same_packages():
-    recipe = (ROOT / "packaging" / "conda" / "meta.yaml").read_text(encoding="utf-8")
-    names = {"opencv-contrib-python-headless": "py-opencv", "OpenEXR": "openexr-python"}
-    for line in CONFIG["options"]["install_requires"].split():
-        name, _, lowest = line.partition(">=")
-        assert f"- {names.get(name, name)} >={lowest}\n" in recipe
