@@ -1,7 +1,7 @@
 """Denoise the frames of a shot, and write each to its file."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -51,6 +51,7 @@ class Finished:
     plan: Plan | None = None  # which stages ran, and why
     resumed: bool = False  # it was there already
     again: str = ""  # why it was made again, if it was there and an earlier run was to be resumed
+    lost: tuple[Failed, ...] = ()  # frames near it that could not be read, and that it was made without
     seconds: float = 0.0  # that it took, but for what was read and written beside the work
 
 
@@ -72,7 +73,8 @@ class RunSettings:
     background: bool = True
     # leave frames alone that are there, whole, and would be the same: with these attributes, of the same files
     resume: bool = False
-    keep_going: bool = False  # where a frame cannot be read, denoised or written, go on with the next
+    # where a frame cannot be read, denoised or written, go on with the next; one that cannot be read counts as missing
+    keep_going: bool = False
     attributes: Mapping[str, str] = field(default_factory=dict)  # written to the header of each file
     # the files that the frames of the shot were made from by an earlier pass (`sources_of`)
     sources: SourcesOf | None = None
@@ -172,10 +174,12 @@ class _ShotDenoiser:
         self.shot = views[0].shot
         self.support = temporal_support(views[0].first_pass, radius, rules)
         self.ahead = self.support - REACH - ("whiten" in rules.allowed)
-        self.sources = sources_of(views, radius, rules, settings.sources)
-        self.readers = [Prefetcher(view.shot, thread, timings) for view in views]
-        self.denoisers, keeper = [], Keeper(in_files=settings.in_files, trims=settings.trims)
-        for reader, view in zip(self.readers, views, strict=True):
+        self.lost: dict[int, Exception] = {}  # frames that could not be read, which count as missing
+        self.sources = sources_of(views, radius, rules, settings.sources, self.lost)
+        keeper = Keeper(in_files=settings.in_files, trims=settings.trims)
+
+        def follow(view: View) -> tuple[Prefetcher, FrameDenoiser]:
+            reader = Prefetcher(view.shot, thread, timings, self.lost)
             stream = FrameStream(
                 reader,
                 rules,
@@ -185,16 +189,49 @@ class _ShotDenoiser:
                 timings=timings,
                 keeper=keeper,
             )
-            self.denoisers.append(
-                FrameDenoiser(stream, denoise, rows=settings.rows, keep_going=settings.keep_going, strength=strength)
-            )
+            going = settings.keep_going
+            return reader, FrameDenoiser(stream, denoise, rows=settings.rows, keep_going=going, strength=strength)
+
+        self._follow = follow
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin anew, with nothing read."""
+        self.readers, self.denoisers = [], []  # first, or two windows would be in memory
+        for reader, denoiser in map(self._follow, self.views):
+            self.readers.append(reader)
+            self.denoisers.append(denoiser)
 
     def make(self, number: int, path: Path, following: int | None) -> Finished | Callable[[], Finished]:
+        """Denoise a frame, as `_make`; with `keep_going`, without the frames that cannot be read."""
+        if not self.settings.keep_going:
+            return self._make(number, path, following)
+        if number in self.lost:
+            raise self.lost[number]
+        made, failure = None, None
+        try:
+            made = self._make(number, path, following)
+        except (ValueError, OSError) as error:
+            failure = error
+        # Without tracebacks, which would keep the window in memory.
+        failed = {n: error.with_traceback(None) for reader in self.readers for n, error in reader.failed.items()}
+        if failed:
+            made = failure = None
+            self.lost |= failed
+            self._begin()
+            return self.make(number, path, following)
+        if made is None:
+            assert failure is not None
+            raise failure
+        return made
+
+    def _make(self, number: int, path: Path, following: int | None) -> Finished | Callable[[], Finished]:
         """Denoise a frame and return the function that writes it; or the frame, if it is there already.
 
         Then begin to read the first frame that the `following` one needs beyond this one's.
         """
         started, attributes = time.perf_counter(), self.settings.attributes
+        near = self.shot.neighbours(number, self.support)
         read_as = [view.shot.reader.layer_summary(number) for view in self.views]
         # With its number: in a shot that one window holds, all frames are made from the same files.
         made_from = describe_sources(self.sources(number), frame=number, layers=read_as, size=list(self.shot.shape))
@@ -225,6 +262,7 @@ class _ShotDenoiser:
             outliers=sum(result.outliers for result in results),
             plan=results[0].plan,
             again=again,
+            lost=tuple(Failed(n, self.lost[n]) for n in near if n in self.lost),
             seconds=time.perf_counter() - started,
         )
         return partial(self._write, finished, results, header)
@@ -242,7 +280,8 @@ class _ShotDenoiser:
         with self.timings.background("write"):
             for read in (self.shot, *(view.first_pass.files for view in self.views if view.first_pass is not None)):
                 if read is not None:
-                    read.reader.check_unchanged(n for n in self.shot.neighbours(number, self.support) if read.has(n))
+                    near = (n for n in self.shot.neighbours(number, self.support) if n not in self.lost)
+                    read.reader.check_unchanged(filter(read.has, near))
             first, *others = ({"color": r.denoised.color, **r.denoised.aovs} for r in results)
             pictures = [
                 (view.shot, layers, result.denoised.extra)
@@ -266,12 +305,21 @@ def temporal_support(first_pass: FirstPass | None, radius: int, rules: Rules) ->
     return REACH + more + (radius if first_pass is None else first_pass.reach(radius))
 
 
-def sources_of(views: Sequence[View], radius: int, rules: Rules, earlier: SourcesOf | None = None) -> SourcesOf:
-    """Return a function from a frame to all files of its temporal support, or those of an `earlier` pass."""
+def sources_of(
+    views: Sequence[View],
+    radius: int,
+    rules: Rules,
+    earlier: SourcesOf | None = None,
+    lost: Container[int] = (),
+) -> SourcesOf:
+    """Return a function from a frame to all files of its temporal support, or those of an `earlier` pass.
+
+    Frames that are `lost` by then are none of them.
+    """
     shot, support = views[0].shot, temporal_support(views[0].first_pass, radius, rules)
 
     def sources(number: int) -> dict[str, Source]:
-        near = shot.neighbours(number, support)
+        near = [n for n in shot.neighbours(number, support) if n not in lost]
         if earlier is not None:
             return {name: source for n in near for name, source in earlier(n).items()}
         files = shot.reader.sources(near)

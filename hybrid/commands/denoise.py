@@ -284,6 +284,7 @@ class _Report:
         self.means: list[tuple[float, float]] = []  # radiance of each noisy frame, with and without its fireflies
         self.plans: dict[int, Plan] = {}
         self.fireflies: dict[int, int] = {}
+        self.lost: set[int] = set()  # frames that others were made without
 
     def add(self, frame: Finished | Failed) -> str:
         """Add a frame; return the message of the progress bar."""
@@ -313,6 +314,13 @@ class _Report:
 
     def _log(self, frame: Finished, share: float) -> None:
         name = f"frame {frame.number}"
+        for other in frame.lost:
+            if other.number not in self.lost:
+                self.lost.add(other.number)
+                LOG.warning(
+                    f"frame {other.number}: {one_line(other.error)}; the frames beside it are made without it, "
+                    "and again by --resume once it is whole"
+                )
         if frame.again:
             LOG.info(f"{name} is made again: {printable(frame.again)}")
         if frame.fireflies:

@@ -257,20 +257,37 @@ def test_a_frame_that_was_asked_for_and_is_not_there_is_an_error(shot_folder, tm
 
 
 @pytest.mark.parametrize("keep_going", [False, True])
-def test_frames_that_cannot_be_made_are_told_by_the_exit_code(tmp_path, capsys, keep_going):
+def test_a_damaged_frame_ends_the_run_or_is_done_without(tmp_path, capsys, keep_going):
+    """With --keep-going all frames whose windows held it failed too, each with the same line."""
     folder, out = Scene(frames=9).write(tmp_path / "in"), tmp_path / "out"
     victim = folder / "shot.1004.exr"
-    victim.write_bytes(victim.read_bytes()[:-2000])
-    options = ["--preset", "draft", *(["--keep-going"] if keep_going else [])]
-    assert run(capsys, "denoise", "--method=classical", folder, "-o", out, *options)[0] == 1
+    whole = victim.read_bytes()
+    victim.write_bytes(whole[:-2000])
+    words = ["denoise", "--method=classical", folder, "-o", out, "--preset", "draft"]
+    code, _, said = run(capsys, *words, *(["--keep-going"] if keep_going else []))
     made = {int(path.name.split(".")[1]) for path in out.glob("*.exr")}
-    code, text, _ = run(capsys, "status", out, "--json")
-    document = json.loads(text)
     assert code == 1
-    assert set(document["finished"]) == made
-    assert {int(number) for number in document["failed"]} == set(range(1001, 1010)) - made
-    # Whatever window the damaged frame is in cannot be made; those beyond can.
-    assert made == ({1001, 1007, 1008, 1009} if keep_going else {1001})
+    assert made == ({*range(1001, 1010)} - {1004} if keep_going else {1001})
+    code, text, _ = run(capsys, "status", out, "--json")
+    assert code == 1
+    assert set(json.loads(text)["finished"]) == made
+    if keep_going:
+        assert [line[:20] for line in said.splitlines() if "shot.1004.exr" in line] == [
+            "warning: frame 1004:",
+            "error: frame 1004: /",
+        ]
+        # The same pictures as if it were not there.
+        victim.unlink()
+        assert run(capsys, *words[:3], "-o", tmp_path / "gap", "--preset", "draft")[0] == 0
+        for number in made:
+            pictures = [read_exr(path / f"shot.{number}.exr") for path in (out, tmp_path / "gap")]
+            first, second = (picture.channel("ViewLayer.Combined.R") for picture in pictures)
+            np.testing.assert_array_equal(first, second)
+        victim.write_bytes(whole)
+        code, _, said = run(capsys, *words, "--resume")
+        assert code == 0
+        again = {int(n) for n in re.findall(r"frame (\d+) is made again", said)}
+        assert {1002, 1003, 1005, 1006} <= again
 
 
 def one_line_error(capsys, *arguments):

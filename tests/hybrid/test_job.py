@@ -96,7 +96,7 @@ def test_frames_that_cannot_be_made(tmp_path):
     victim = folder / "shot.1006.exr"
     victim.write_bytes(victim.read_bytes()[:-2000])
     made = list(hybrid.denoise_shot(hybrid.open_shot(folder), tmp_path / "out", preset="draft", keep_going=True))
-    assert [frame.number for frame in made if isinstance(frame, Failed)] == [1004, 1005, 1006]
+    assert [frame.number for frame in made if isinstance(frame, Failed)] == [1006]
     with pytest.raises(ValueError, match=r"shot\.1006\.exr"):
         list(hybrid.denoise_shot(hybrid.open_shot(folder), tmp_path / "out", preset="draft"))
 

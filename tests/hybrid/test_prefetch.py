@@ -93,6 +93,17 @@ def test_an_error_comes_when_the_frame_is_asked_for_and_each_time(thread):
         with pytest.raises(ValueError, match="frame 2 is damaged"):
             frames.read(2)
     assert frames.read(3).number == 3
+    assert [*frames.failed] == [2]
+
+
+def test_a_frame_that_is_lost_is_missing_and_not_read_ahead(thread):
+    told = Told(damaged={2})
+    frames = Prefetcher(told, thread, Timings(), {2: ValueError()})
+    frames.expect([1, 2, 3])
+    assert [frames.has(number) for number in (1, 2, 3)] == [True, False, True]
+    assert [frames.read(number).number for number in (1, 3)] == [1, 3]
+    thread.submit(lambda: None).result()
+    assert told.read_so_far == [1, 3]
 
 
 def test_it_is_the_shot_otherwise_and_says_what_it_costs(thread):

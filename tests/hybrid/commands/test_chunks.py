@@ -98,8 +98,8 @@ def test_the_reasons_why_frames_failed_are_told_once(shot, tmp_path, capsys):
     assert main(["denoise", str(broken), "-o", str(tmp_path / "out"), *OPTIONS, "--keep-going", "--jobs", "2"]) == 1
     said = capsys.readouterr().err
     reasons = re.findall(r"error: (.*): frame (\d+): .*shot\.1005\.exr: damaged", said)
-    assert sorted(reasons) == [("1001-1003", "1003"), ("1004-1005", "1004"), ("1004-1005", "1005")]
-    assert said.count("2 frames could not be made: 1004-1005") == 1
+    assert reasons == [("1004-1005", "1005")]
+    assert said.count("1 frames could not be made: 1005") == 1
 
 
 @pytest.mark.posix
