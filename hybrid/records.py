@@ -24,6 +24,8 @@ from hybrid.runtime.timing import Timings
 FOLDER = "ravg"
 NAMELESS = "frames"  # name of a sequence whose file names are numbers alone
 ALL_PACKAGES = (*PACKAGES, "OpenEXR", "pyoidn", "torch")  # all packages whose versions are recorded
+UNTRIED = "not tried"
+STATES = "finished", "running", "failed", "missing", UNTRIED  # of a frame; missing: finished, and its file is gone
 LONGEST = 60  # a longer list of frames is named by its ends and a hash in the record's name
 
 
@@ -37,7 +39,7 @@ class Record:
     def __init__(self, folder: Path, name: str, numbers: Sequence[int], **facts: object) -> None:
         if (folder / FOLDER).is_symlink():
             raise ValueError(f"{folder / FOLDER} is a link, expected a folder for records, or none yet")
-        self.path = folder / FOLDER / f"{name or NAMELESS}.{_range(numbers)}.json"
+        self.path = record_path(folder, name, numbers)
         if self.path.exists() and _read(self.path) is None:
             raise ValueError(f"{self.path} is there and no record of ravg, expected a name of its own")
         self._start = time.time()
@@ -61,10 +63,9 @@ class Record:
         return [int(n) for n, entry in self._document["frames"].items() if entry["state"] in states]
 
     @property
-    def files(self) -> list[Path]:
-        """The files of the frames that this run made, in the order of their names."""
-        entries = self._document["frames"].values()
-        return sorted(self.path.parent.parent / entry["file"] for entry in entries if entry["state"] == "made")
+    def frames(self) -> Mapping[int, Mapping[str, Any]]:
+        """Frame → its state and facts (`add`)."""
+        return {int(number): entry for number, entry in self._document["frames"].items()}
 
     def add(self, number: int, state: str, **facts: object) -> None:
         """Add a frame, whose state is "made", "there" (made by an earlier run) or "failed"."""
@@ -93,19 +94,20 @@ class Record:
 class Status:
     """State of the frames of a sequence, from the records of a folder."""
 
-    # frames that some run was asked for, that are finished, and that a live run has still to make
-    asked: set[int] = field(default_factory=set)
-    finished: set[int] = field(default_factory=set)
-    running: set[int] = field(default_factory=set)
-    failed: dict[int, str] = field(default_factory=dict)  # frame → reason
+    # frame that some run was asked for → one of `STATES`, and the reason for it
+    frames: dict[int, tuple[str, str]] = field(default_factory=dict)
     seconds: list[float] = field(default_factory=list)  # time of each frame that was made
     workers: int = 0  # number of live runs
     records: list[dict[str, Any]] = field(default_factory=list)  # oldest first
 
+    def numbers(self, state: str) -> dict[int, str]:
+        """Return the frames in this state, ascending, each with the reason for it."""
+        return {n: why for n, (found, why) in sorted(self.frames.items()) if found == state}
+
     @property
-    def missing(self) -> set[int]:
-        """Frames that were asked for, and that are neither finished nor running nor failed."""
-        return self.asked - self.finished - self.running - set(self.failed)
+    def left(self) -> int:
+        """Number of frames that are not finished."""
+        return len(self.frames) - len(self.numbers("finished"))
 
     @property
     def seconds_per_frame(self) -> float | None:
@@ -115,54 +117,66 @@ class Status:
     @property
     def seconds_left(self) -> float | None:
         """Time for the unfinished frames with the current number of runs, or with one."""
-        if self.seconds_per_frame is None:
-            return None
-        return len(self.asked - self.finished) * self.seconds_per_frame / max(self.workers, 1)
+        return None if self.seconds_per_frame is None else self.left * self.seconds_per_frame / max(self.workers, 1)
+
+
+def record_path(folder: Path, name: str, numbers: Sequence[int]) -> Path:
+    """Return the file of a run's record, as for `Record`."""
+    return folder / FOLDER / f"{name or NAMELESS}.{_range(numbers)}.json"
 
 
 def read_records(folder: Path, name: str | None = None) -> Iterator[tuple[Path, dict[str, Any]]]:
     """Yield the records in a folder of frames, or of a sequence there, with their files, oldest first."""
     paths = sorted((folder / FOLDER).glob("*.json")) if (folder / FOLDER).is_dir() else []
     if name is not None:
-        paths = [path for path in paths if path.stem.rpartition(".")[0] == (name or NAMELESS)]
+        paths = [path for path in paths if _sequence_of(path) == (name or NAMELESS)]
     found = [(path, document) for path in paths if (document := _read(path)) is not None]
     yield from sorted(found, key=lambda item: item[1]["started"])
 
 
-def gather_status(folder: Path, name: str | None = None, frames: Collection[int] | None = None) -> Status:
-    """Return the status of a folder's runs, of these frames or those asked for; FileNotFoundError without records."""
-    status = Status()
+def recorded_sequences(folder: Path) -> list[str]:
+    """Return the names of the sequences in a folder that have records; FileNotFoundError if there are none."""
+    if names := sorted({_sequence_of(path) for path, _ in read_records(folder)}):
+        return names
+    raise FileNotFoundError(
+        f"{folder} has no records of runs in {folder / FOLDER}, expected the output folder of ravg denoise"
+    )
+
+
+def gather_status(folder: Path, name: str, frames: Collection[int] | None = None) -> Status:
+    """Return the status of a sequence in a folder, of these frames or those that its runs were asked for."""
+    status = Status(dict.fromkeys(frames or (), (UNTRIED, "")))
     for _, document in read_records(folder, name):
         status.records.append(document)
-        wanted = {n for n in document["asked"] if frames is None or n in frames}
-        status.asked |= wanted
         alive = is_running(document)
         status.workers += alive
-        for number in wanted:  # a later record replaces an earlier one
-            entry = document["frames"].get(str(number))
-            if entry is None:
-                if number in status.finished:
-                    continue
-                if alive:
-                    status.running.add(number)
-                elif "error" in document:
-                    status.failed[number] = document["error"]
-                continue
-            status.running.discard(number)
-            status.failed.pop(number, None)
-            status.finished.discard(number)
-            if entry["state"] == "failed":
-                status.failed[number] = entry["error"]
-            elif (folder / entry["file"]).is_file():
-                status.finished.add(number)
-            if entry["state"] == "made":
+        for number in document["asked"] if frames is None else {*document["asked"]} & {*frames}:
+            entry, before = document["frames"].get(str(number)), status.frames.get(number, (UNTRIED, ""))
+            if entry is None and alive and before[0] != "finished":
+                state = "running", ""
+            elif entry is None:
+                state = (UNTRIED, _why_untried(document)) if before[0] == UNTRIED else before
+            elif entry["state"] == "failed":
+                state = "failed", entry["error"]
+            else:
+                state = "finished" if (folder / entry["file"]).is_file() else "missing", ""
+            status.frames[number] = state
+            if entry is not None and entry["state"] == "made":
                 status.seconds.append(entry["seconds"])
-    if not status.records:
-        raise FileNotFoundError(
-            f"{folder} has no records of runs in {folder / FOLDER}, expected the output folder of ravg denoise"
-        )
-    status.asked |= set(frames or ())
     return status
+
+
+def _why_untried(document: Mapping[str, Any]) -> str:
+    """Why a run that has ended did not come to a frame."""
+    if document["state"] == "running":
+        return f"the process of the run is gone ({document['process']} on {document['host']})"
+    if "error" in document:
+        return f"the run ended: {document['error']}"
+    return "the run was stopped" if document["state"] == "stopped" else ""
+
+
+def _sequence_of(path: Path) -> str:
+    return path.stem.rpartition(".")[0]
 
 
 def is_running(document: Mapping[str, Any]) -> bool:

@@ -18,11 +18,13 @@ from typing import Any, NamedTuple
 
 import typer
 
-from hybrid.commands.log import LOG, Progress
+from hybrid.commands.log import LOG, Progress, summarize
 from hybrid.runtime.interrupt import INTERRUPTED, interruptible
 
 # Parameters that concern the submitting process alone.
 NOT_PASSED_ON = ("scheduler", "chunk", "log_format", "log_file", "quiet", "verbose", "preview", "contact_sheet", "fps")
+
+ALIKE = "Settings", "Passes", "First pass", "Note"  # lines of a summary that do not depend on the frames of a chunk
 
 
 class Chunk(NamedTuple):
@@ -62,16 +64,20 @@ class ChunkLog:
         self._bar = Progress(title, sum(chunk.size for chunk in chunks.values()), unit)
         self._lock = threading.Lock()  # each chunk has a thread that reads its records
         self._failed: list[str] = []
+        self._said: set[str] = set()  # lines of the summary
         self._errors: dict[str, list[str]] = {name: [] for name in chunks}  # those of each chunk that are logged
 
     def add(self, name: str, record: Mapping[str, Any]) -> None:
-        """Log a warning or an error of a chunk, each error once, or advance the bar by its progress."""
+        """Log a warning, an error or a line of the summary, the latter two once, or advance the bar."""
         with self._lock:
             if "percent" in record:
                 size = self._chunks[name].size
                 self._shares[name] = max(self._shares[name], record["percent"] / 100 * size)
                 if (gained := sum(self._shares.values()) - self._bar.done) > 0:
                     self._bar.advance(gained, record["message"])
+            elif record.get("label") in ALIKE and record["message"] not in self._said:
+                self._said.add(record["message"])
+                summarize(record["label"], record["message"])
             elif record["level"] == "warning":
                 LOG.warning(f"{name}: {record['message']}")
             elif record["level"] == "error" and record["message"] not in self._errors[name]:

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
@@ -30,7 +30,7 @@ from hybrid.memory import parse_size
 from hybrid.pipeline import Failed, Finished
 from hybrid.plan import NEURAL_STAGES, Plan, merge
 from hybrid.preview import check_png, check_preview, write_contact_sheet, write_preview
-from hybrid.records import Record, read_records, sequence_name
+from hybrid.records import FOLDER, Record, read_records, record_path, sequence_name
 from hybrid.runtime.interrupt import INTERRUPTED, interruptible
 from hybrid.runtime.system import peak_memory
 from hybrid.runtime.timing import Timings
@@ -140,14 +140,19 @@ def _denoise_in_chunks(
     run: Callable[[str, Mapping[str, Chunk]], None],
 ) -> None:
     """Denoise the shot, a chunk of its frames in a process, by this command with other parameters."""
+    start = time.monotonic()
     shot = request.shot.open()
     check_paths(shot, request.output, request.options, paths=request.paths)
-    size, chunks = size_of(len(shot.numbers)), {}
-    for start in range(0, len(shot.numbers), size):
-        part = shot.numbers[start : start + size]
-        name = format_frames(part)
-        words = arguments_of(context, {**changes, "frames": name})
-        chunks[name] = Chunk(shots.in_view(words, view), len(part))
+    _summarize_shot(request, shot)
+    first = output_path(request.output, shot, shot.numbers[0])
+    folder, name = first.parent, sequence_name(first)
+    before = {path: record["started"] for path, record in read_records(folder, name)}
+    size, chunks, paths = size_of(len(shot.numbers)), {}, []
+    for begin in range(0, len(shot.numbers), size):
+        part = shot.numbers[begin : begin + size]
+        words = arguments_of(context, {**changes, "frames": format_frames(part)})
+        chunks[format_frames(part)] = Chunk(shots.in_view(words, view), len(part))
+        paths.append(record_path(folder, name, part))
     failed = None
     try:
         run(str(context.info_name), chunks)
@@ -155,20 +160,14 @@ def _denoise_in_chunks(
         if not request.options.keep_going or end.exit_code == INTERRUPTED:
             raise
         failed = end
-    first = output_path(request.output, shot, shot.numbers[0])
-    _write_pictures(request, shot.views[0], _made(first) if failed else shot.numbers)
-    if shot.missing:
-        LOG.error(f"frames {format_frames(shot.missing)} were asked for and are not there")
-        raise typer.Exit(1)
+    new = {p: record for p, record in read_records(folder, name) if p in paths and record["started"] != before.get(p)}
+    frames = {int(n): entry for path in paths if path in new for n, entry in new[path]["frames"].items()}
+    frames |= {n: {"state": "failed"} for n in (*shot.missing, *(shot.numbers if failed else ())) if n not in frames}
+    peak = max((record.get("peak_bytes", 0) for record in new.values()), default=0)
+    cost = _Cost(time.monotonic() - start, peak, " per process")
+    _finish(request, shot.views[0], frames, cost, str(folder / FOLDER))
     if failed:
         raise failed
-
-
-def _made(first: Path) -> list[int]:
-    """The frames of a sequence that are finished by their last records."""
-    documents = [document for _, document in read_records(first.parent, sequence_name(first))]
-    states = {int(n): entry["state"] for document in documents for n, entry in document["frames"].items()}
-    return [number for number, state in states.items() if state != "failed"]
 
 
 def _denoise(request: Request) -> None:
@@ -176,7 +175,8 @@ def _denoise(request: Request) -> None:
     start = time.monotonic()
     shot = request.shot.open()
     job = Job.open(shot, request.output, request.options, request.paths, _failure_on_record(request, shot))
-    _summarize_input(request, job)
+    _summarize_shot(request, job.views[0])
+    _summarize_job(job)
     shots.log_findings(job.report, job.views)
     first = output_path(request.output, shot, shot.numbers[0])
     record = Record(
@@ -206,18 +206,15 @@ def _denoise(request: Request) -> None:
     except KeyboardInterrupt:
         raise typer.Exit(INTERRUPTED) from None
     except Exception as error:
+        words = one_line(error)
+        if left := [number for number in shot.numbers if number not in record.frames]:
+            record.add(left[0], "failed", error=words)  # frames are made in their order
         with suppress(OSError):  # on a full disk, say
-            record.write(job.timings, "failed", error=one_line(error))
+            record.write(job.timings, "failed", error=words)
         raise
     record.write(job.timings, "finished")
-    if there := record.numbers("there"):
-        summarize("Note", f"{len(there)} of {len(shot)} frames were finished already")
-    _summarize_result(request, record, time.monotonic() - start)
-    _write_pictures(request, job.views[0], record.numbers("made", "there"))
-    _print_weights(job)
-    if failed := record.numbers("failed"):
-        LOG.error(f"{len(failed)} frames could not be made: {format_frames(failed)}")
-        raise typer.Exit(1)
+    cost = _Cost(time.monotonic() - start, peak_memory())
+    _finish(request, job.views[0], record.frames, cost, f"-v, or {record.path}", job)
 
 
 @contextmanager
@@ -236,20 +233,23 @@ def _failure_on_record(request: Request, shot: Shot) -> Iterator[None]:
         raise
 
 
-def _summarize_input(request: Request, job: Job) -> None:
-    """Log what is read, which layers of it are used, and what each frame starts from."""
-    view, source = job.views[0], job.first_passes[0]
-    layers = view.layers(view.numbers[0])
-    method = "" if job.options.method == "network" else f"method {job.options.method}"
-    computed = dict.fromkeys([*job.denoiser.devices.values(), source.device, job.denoiser.settings.get("precision")])
-    how = ", ".join(str(word) for word in computed if word)
-    parts = f"ravg {version('ravg')}", "denoise", method, f"preset {job.preset}", how
-    LOG.info(" · ".join(part for part in parts if part))
-    height, width = view.shape
+def _summarize_shot(request: Request, view: Shot) -> None:
+    """Log what is read."""
+    layers, (height, width) = view.layers(view.numbers[0]), view.shape
     samples = [] if layers.samples is None else [f"{layers.samples:g} samples per pixel"]
     numbers = f"{format_frames(view.numbers)} ({len(view.numbers)})"
     facts = [f"frames {numbers}", f"{width}×{height}", layers.profile, *samples]
     summarize("Input", f"{request.shot.shot}, {', '.join(facts)}")
+
+
+def _summarize_job(job: Job) -> None:
+    """Log the settings, the layers that are used, and what each frame starts from."""
+    view, source = job.views[0], job.first_passes[0]
+    layers = view.layers(view.numbers[0])
+    method = "" if job.options.method == "network" else f"method {job.options.method}"
+    computed = dict.fromkeys([*job.denoiser.devices.values(), source.device, job.denoiser.settings.get("precision")])
+    parts = [f"ravg {version('ravg')}", method, f"preset {job.preset}", *map(str, filter(None, computed))]
+    summarize("Settings", ", ".join(filter(None, parts)))
     used, missing = [], []
     for role, words in ROLE_FACTS.items():
         name, layer = words.get("summary"), getattr(layers, role)
@@ -262,16 +262,45 @@ def _summarize_input(request: Request, job: Job) -> None:
     summarize("First pass", f"{source.name} ({source.reason}){later}")
 
 
-def _summarize_result(request: Request, record: Record, seconds: float) -> None:
-    """Log where the frames are, what they cost, and how to view them."""
-    if made := record.files:
-        last = f" to {made[-1].name}" if len(made) > 1 else ""
-        summarize("Output", f"{made[0]}{last} ({len(made)} frames)")
-        each = f", {seconds / len(made):.2g} s per frame"
-        summarize("Total", f"{duration(seconds)}{each}, peak memory {peak_memory() / 2**20:.0f} MiB")
+class _Cost(NamedTuple):
+    """The time of a run in seconds, and its peak memory in bytes, of what."""
+
+    seconds: float
+    peak: int
+    of: str = ""
+
+
+def _finish(
+    request: Request,
+    view: Shot,
+    frames: Mapping[int, Mapping[str, Any]],
+    cost: _Cost,
+    details: str,
+    job: Job | None = None,
+) -> None:
+    """Log what a run made of its frames (`Record.frames`), and write pictures; typer.Exit with 1 if a frame failed."""
+    made, there, failed = ([n for n in frames if frames[n]["state"] == state] for state in ("made", "there", "failed"))
+    if shining := [n for n in made if frames[n].get("fireflies")]:
+        count = sum(frames[n]["fireflies"] for n in shining)
+        summarize("Fireflies", f"{count} removed (frames {format_frames(shining)})")
+    if there:
+        summarize("Resumed", f"{len(there)} of {len(view)} frames were finished already")
+    if made:
+        names = sorted(output_path(request.output, view, n) for n in made)
+        last = f" to {names[-1].name}" if len(made) > 1 else ""
+        summarize("Output", f"{names[0]}{last} ({len(made)} frames)")
+        each = f", {cost.seconds / len(made):.2g} s per frame"
+        peak = f"peak memory {cost.peak / 2**20:.0f} MiB{cost.of}"
+        summarize("Total", f"{duration(cost.seconds)}{each}, {peak}")
     words = ["ravg", "view", request.output, "--beside", request.shot.shot]
     summarize("Next", subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words))
-    summarize("Details", f"-v, or {record.path}")
+    summarize("Details", details)
+    _write_pictures(request, view, {*made, *there})
+    if job is not None:
+        _print_weights(job)
+    if failed:
+        LOG.error(f"{len(failed)} frames could not be made: {format_frames(sorted(failed))}")
+        raise typer.Exit(1)
 
 
 class _Report:
@@ -283,7 +312,6 @@ class _Report:
         self.pixels = self.outliers = 0
         self.means: list[tuple[float, float]] = []  # radiance of each noisy frame, with and without its fireflies
         self.plans: dict[int, Plan] = {}
-        self.fireflies: dict[int, int] = {}
         self.lost: set[int] = set()  # frames that others were made without
 
     def add(self, frame: Finished | Failed) -> str:
@@ -305,7 +333,7 @@ class _Report:
         facts: dict[str, object] = {"file": frame.path.name, "seconds": round(frame.seconds, 3)}
         if not frame.resumed:
             self.means.append((light, frame.mean))
-            facts |= {"mean": light, "light_removed": share}
+            facts |= {"mean": light, "light_removed": share, "fireflies": frame.fireflies}
         stages = sorted(frame.plan.stages) if frame.plan else None
         self.record.add(frame.number, "there" if frame.resumed else "made", **facts, stages=stages)
         findings = [vars(finding) for finding in self.findings]
@@ -324,7 +352,6 @@ class _Report:
         if frame.again:
             LOG.info(f"{name} is made again: {printable(frame.again)}")
         if frame.fireflies:
-            self.fireflies[frame.number] = frame.fireflies
             LOG.debug(f"{name}: {frame.fireflies} fireflies removed, {share:.2%} of its light")
         if frame.repaired:
             LOG.warning(f"{name}: {frame.repaired} pixels were not finite, filled in from neighbours; check the render")
@@ -343,9 +370,6 @@ class _Report:
                 LOG.debug(f"  {'run' if decision.on else 'not run'}: {decision.stage} ({decision.reason})")
             if decision.stage == "fixed-noise" and decision.on and not decision.forced:
                 LOG.warning(f"constant seed: {decision.reason}")
-        if self.fireflies:
-            frames = format_frames(sorted(self.fireflies))
-            summarize("Note", f"fireflies removed: {sum(self.fireflies.values())} (frames {frames})")
         stages = {name: asdict(stage) for name, stage in timings.stages.items()}
         LOG.debug(timings.table(self.pixels), extra={"facts": {"stages": stages}})
 

@@ -9,7 +9,16 @@ import typer
 from hybrid.commands import options as opt
 from hybrid.commands.log import duration, print_table, printable
 from hybrid.files.sequences import format_frames, parse_frames, parse_pattern
-from hybrid.records import Status, gather_status, is_running, sequence_name
+from hybrid.records import (
+    NAMELESS,
+    STATES,
+    UNTRIED,
+    Status,
+    gather_status,
+    is_running,
+    recorded_sequences,
+    sequence_name,
+)
 
 
 @opt.command("status")
@@ -25,44 +34,40 @@ def status(output: str, frames: str | None = None, as_json: bool = False) -> Non
         folder, name = pattern.folder, sequence_name(pattern.path(1))
     with opt.usage():
         asked = None if frames is None else parse_frames(frames)
-    found = gather_status(folder, name, asked)
-    left = found.asked - found.finished
+    names = recorded_sequences(folder)
+    if name is not None and (name or NAMELESS) not in names:
+        raise FileNotFoundError(f"{folder} has no records of {name or NAMELESS}, expected one of {', '.join(names)}")
+    found = {n: gather_status(folder, n, asked) for n in (names if name is None else [name or NAMELESS])}
     if as_json:
-        document = {
-            **{name: sorted(getattr(found, name)) for name in ("asked", "finished", "running", "missing")},
-            "failed": {str(number): found.failed[number] for number in sorted(found.failed)},
-            "workers": found.workers,
-            "seconds_per_frame": found.seconds_per_frame,
-            "seconds_left": found.seconds_left if left else 0.0,
-            "records": found.records,
-        }
-        typer.echo(json.dumps(document, indent=1))
+        typer.echo(json.dumps({"sequences": [{"name": n, **_document(each)} for n, each in found.items()]}, indent=1))
     else:
-        _show(found)
-        for state, numbers in (("finished", found.finished), ("running", found.running), ("missing", found.missing)):
-            if numbers:
-                typer.echo(f"{state}: {len(numbers)} of {len(found.asked)} frames, {format_frames(numbers)}")
-        for error in dict.fromkeys(found.failed.values()):
-            numbers = {number for number, other in found.failed.items() if other == error}
-            listed = f"{len(numbers)} of {len(found.asked)} frames, {format_frames(numbers)}"
-            typer.echo(f"failed: {listed}: {printable(error)}")
-        if found.seconds_per_frame is not None:
-            words = f"{found.seconds_per_frame:.2f} s a frame"
-            if left and found.seconds_left is not None:
-                words += f"; about {duration(found.seconds_left)} left with {max(found.workers, 1)} running"
-            typer.echo(words)
-    if left:
+        for sequence, each in found.items():
+            _show(sequence, each)
+    if any(each.left for each in found.values()):
         raise typer.Exit(1)
 
 
-def _show(found: Status) -> None:
+def _document(found: Status) -> dict[str, object]:
+    """The status as JSON: lists of frames, and those with reasons by frame."""
+    with_reasons = "failed", UNTRIED
+    return {
+        "asked": sorted(found.frames),
+        **{state: found.numbers(state) if state in with_reasons else [*found.numbers(state)] for state in STATES},
+        "workers": found.workers,
+        "seconds_per_frame": found.seconds_per_frame,
+        "seconds_left": found.seconds_left if found.left else 0.0,
+        "records": found.records,
+    }
+
+
+def _show(name: str, found: Status) -> None:
+    """Print a table of the runs of a sequence, and the state of its frames."""
     rows = []
     for record in found.records:
         made = [entry["seconds"] for entry in record["frames"].values() if entry["state"] == "made"]
-        state = record["state"] if record["state"] != "running" or is_running(record) else "died"
         row = (
             format_frames(record["asked"]),
-            state,
+            record["state"] if record["state"] != "running" or is_running(record) else "process gone",
             f"{len(made)} of {len(record['asked'])}",
             f"{sum(made) / len(made):.2f}" if made else "–",
             f"{record.get('peak_bytes', 0) / 2**20:.0f} MiB",
@@ -70,4 +75,15 @@ def _show(found: Status) -> None:
             time.strftime("%m-%d %H:%M:%S", time.localtime(record.get("updated", record["started"]))),
         )
         rows.append(row)
-    print_table(("frames", "state", "made", "s a frame", "peak", "host", "last update"), rows)
+    print_table(("frames", "state", "made", "s a frame", "peak", "host", "last update"), rows, printable(name))
+    for state in STATES:
+        reasons = found.numbers(state)
+        for reason in dict.fromkeys(reasons.values()):
+            numbers = [number for number, why in reasons.items() if why == reason]
+            words = f"{state}: {len(numbers)} of {len(found.frames)} frames, {format_frames(numbers)}"
+            typer.echo(f"{words}: {printable(reason)}" if reason else words)
+    if found.seconds_per_frame is not None:
+        words = f"{found.seconds_per_frame:.2f} s a frame"
+        if found.left and found.seconds_left is not None:
+            words += f"; about {duration(found.seconds_left)} left with {max(found.workers, 1)} running"
+        typer.echo(words)

@@ -218,7 +218,7 @@ def test_a_run_is_ten_lines(tmp_path, capsys):
     shot = Path(__file__).parents[2] / "examples" / "shot" / "noisy.####.exr"
     _, _, err = run(capsys, "denoise", shot, "-o", tmp_path / "o", "--preset", "draft", "--frames", "8-10")
     lines = [line for line in err.splitlines() if " of 3 frames, " not in line and "compiling" not in line]
-    labels = ["ravg", "Input", "Passes", "First", "Output", "Total", "Next", "Details"]
+    labels = ["Input", "Settings", "Passes", "First", "Output", "Total", "Next", "Details"]
     assert [line.split()[0] for line in lines] == labels
     assert "3 frames" in next(line for line in lines if line.startswith("Output"))
 
@@ -270,7 +270,10 @@ def test_a_damaged_frame_ends_the_run_or_is_done_without(tmp_path, capsys, keep_
     assert made == ({*range(1001, 1010)} - {1004} if keep_going else {1001})
     code, text, _ = run(capsys, "status", out, "--json")
     assert code == 1
-    assert set(json.loads(text)["finished"]) == made
+    (status,) = json.loads(text)["sequences"]
+    assert set(status["finished"]) == made
+    assert [*status["failed"]] == (["1004"] if keep_going else ["1002"])
+    assert [*status["not tried"]] == ([] if keep_going else [str(n) for n in range(1003, 1010)])
     if keep_going:
         assert [line[:20] for line in said.splitlines() if "shot.1004.exr" in line] == [
             "warning: frame 1004:",

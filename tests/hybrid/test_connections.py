@@ -364,4 +364,4 @@ def test_the_status_of_a_sequence_is_not_that_of_its_folder(shot_folder, tmp_pat
         assert main([*words, "--preset", "draft"]) == 0
     capsys.readouterr()
     assert main(["status", str(tmp_path / "out" / "b.####.exr"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["asked"] == [1002]
+    assert json.loads(capsys.readouterr().out)["sequences"][0]["asked"] == [1002]

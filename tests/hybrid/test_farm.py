@@ -66,7 +66,7 @@ def test_frame_by_frame_and_backwards(shot, whole, tmp_path, capsys):
     assert len(list((out / "ravg").glob("*.json"))) == FRAMES
     capsys.readouterr()
     assert main(["status", str(out), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["finished"] == list(range(1001, 1001 + FRAMES))
+    assert json.loads(capsys.readouterr().out)["sequences"][0]["finished"] == list(range(1001, 1001 + FRAMES))
 
 
 def test_chunks_of_three_by_four_processes_at_once(shot, whole, tmp_path):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hybrid.cli import main
-from hybrid.records import FOLDER, Record, gather_status, read_records, sequence_name
+from hybrid.records import FOLDER, Record, gather_status, read_records, recorded_sequences, sequence_name
 from hybrid.runtime.timing import Timings
 
 
@@ -30,10 +30,11 @@ def test_runs_of_one_shot_write_one_record_each(tmp_path):
         "shot.4-6.json",
         "shot.7-9.json",
     ]
+    assert recorded_sequences(tmp_path) == ["other", "shot"]
     status = gather_status(tmp_path, "shot")
-    assert status.asked == set(range(1, 10))
-    assert status.finished == {1, 4, 7}
-    assert status.running == {2, 3, 5, 6, 8, 9}
+    assert [*status.frames] == [*range(1, 10)]
+    assert [*status.numbers("finished")] == [1, 4, 7]
+    assert [*status.numbers("running")] == [2, 3, 5, 6, 8, 9]
     assert status.workers == 3
     assert status.seconds_per_frame == 2
     assert status.seconds_left == 6 * 2 / 3
@@ -41,11 +42,11 @@ def test_runs_of_one_shot_write_one_record_each(tmp_path):
 
 @pytest.mark.posix
 def test_what_ended_is_not_running(tmp_path):
-    for state in ("finished", "stopped"):
+    for state, why in (("finished", ""), ("stopped", "the run was stopped")):
         record = Record(tmp_path, state, [1, 2])
         made(tmp_path, record, 1)
         record.write(Timings(), state)
-        assert gather_status(tmp_path, state).missing == {2}
+        assert gather_status(tmp_path, state).numbers("not tried") == {2: why}
     record = Record(tmp_path, "killed", [1, 2])
     made(tmp_path, record, 1)
     document = json.loads(record.path.read_text())
@@ -53,9 +54,10 @@ def test_what_ended_is_not_running(tmp_path):
     if child == 0:
         os._exit(0)
     os.waitpid(child, 0)  # a process that is no more
-    for host, running in ((platform.node(), set()), ("elsewhere", {2})):
+    gone = f"the process of the run is gone ({child} on {platform.node()})"
+    for host, state in ((platform.node(), ("not tried", gone)), ("elsewhere", ("running", ""))):
         record.path.write_text(json.dumps({**document, "process": child, "host": host}))
-        assert gather_status(tmp_path, "killed").running == running
+        assert gather_status(tmp_path, "killed").frames[2] == state
 
 
 def test_a_later_run_overrules(tmp_path):
@@ -63,24 +65,26 @@ def test_a_later_run_overrules(tmp_path):
     made(tmp_path, first, 1)
     first.add(2, "failed", error="shot.2.exr: damaged")
     first.write(Timings())
-    assert gather_status(tmp_path).failed == {2: "shot.2.exr: damaged"}
+    failed, status = ("failed", "shot.2.exr: damaged"), gather_status(tmp_path, "shot")
+    assert (status.frames[2], status.frames[3]) == (failed, ("running", ""))
     first.write(Timings(), "failed", error="no space left")
-    assert gather_status(tmp_path).failed == {2: "shot.2.exr: damaged", 3: "no space left"}
+    status = gather_status(tmp_path, "shot")
+    assert (status.frames[2], status.frames[3]) == (failed, ("not tried", "the run ended: no space left"))
     second = Record(tmp_path, "shot", [2, 3])
     made(tmp_path, second, 2, 3)
     second.write(Timings(), "finished")
-    status = gather_status(tmp_path)
-    assert status.finished == {1, 2, 3}
-    assert not status.failed
+    status = gather_status(tmp_path, "shot")
+    assert [*status.numbers("finished")] == [1, 2, 3]
+    assert not status.left
     (tmp_path / "shot.3.exr").unlink()  # somebody has tidied up
-    assert gather_status(tmp_path).missing == {3}
+    assert [*gather_status(tmp_path, "shot").numbers("missing")] == [3]
 
 
-def test_frames_that_no_run_was_asked_for_are_missing_where_they_are_named(tmp_path):
+def test_frames_that_no_run_was_asked_for_are_not_tried_where_they_are_named(tmp_path):
     made(tmp_path, Record(tmp_path, "shot", [1, 2]), 1, 2)
-    assert gather_status(tmp_path).missing == set()
-    assert gather_status(tmp_path, frames=range(1, 5)).missing == {3, 4}
-    assert gather_status(tmp_path, frames=[2]).asked == {2}
+    assert gather_status(tmp_path, "shot").left == 0
+    assert gather_status(tmp_path, "shot", frames=range(1, 5)).numbers("not tried") == {3: "", 4: ""}
+    assert [*gather_status(tmp_path, "shot", frames=[2]).frames] == [2]
 
 
 def test_long_lists_of_frames_have_short_and_different_names(tmp_path):
@@ -98,7 +102,7 @@ def test_another_file_is_not_overwritten(tmp_path):
         Record(tmp_path, "shot", [1])
     assert path.read_text() == '{"frames": "mine"}'
     with pytest.raises(FileNotFoundError, match="no records"):
-        gather_status(tmp_path)
+        recorded_sequences(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -158,7 +162,7 @@ def test_what_is_no_file_among_the_records_is_left_out(tmp_path, kind):
         path.mkdir()
     else:
         path.symlink_to(path)
-    assert gather_status(tmp_path).finished == {1}
+    assert [*gather_status(tmp_path, "shot").numbers("finished")] == [1]
 
 
 @pytest.mark.parametrize(
@@ -166,6 +170,9 @@ def test_what_is_no_file_among_the_records_is_left_out(tmp_path, kind):
 )
 def test_names_of_sequences(tmp_path, file, name):
     assert sequence_name(tmp_path / file) == name
+
+
+DRAFT = "--preset", "draft"
 
 
 def run(capsys, *arguments):
@@ -183,14 +190,15 @@ def test_status_of_two_chunks(shot_folder, tmp_path, capsys):
     assert "finished: 2 of 2 frames, 1001-1002" in text
     code, text, _ = run(capsys, "status", out, "--frames", "1001-1003")
     assert code == 1
-    assert "missing: 1 of 3 frames, 1003" in text
+    assert "not tried: 1 of 3 frames, 1003" in text
     (shot_folder / "shot.1003.exr").write_bytes(b"damaged")
     assert run(capsys, *words, "--frames", "1003")[0] == 1
     code, text, _ = run(capsys, "status", out.parent, "--json")
-    document = json.loads(text)
+    (document,) = json.loads(text)["sequences"]
     assert code == 1
+    assert document["name"] == "done"
     assert document["finished"] == [1001, 1002]
-    assert "shot.1003.exr" in document["failed"]["1003"]
+    assert "shot.1003.exr" in document["not tried"]["1003"]  # it ended before its first frame
     first = document["records"][0]
     assert first["host"] == platform.node()
     assert {"ravg", "numpy", "numba"} <= first["versions"].keys()
@@ -200,6 +208,26 @@ def test_status_of_two_chunks(shot_folder, tmp_path, capsys):
     assert len(first["plan"]) > 5
     assert run(capsys, "status", tmp_path)[0] == 1
     assert FOLDER not in [path.name for path in tmp_path.iterdir()]
+
+
+def test_sequences_of_one_folder_are_named_and_counted_apart(shot_folder, tmp_path, capsys):
+    """Their frames were counted together: those of one hid that those of another had failed."""
+    out = tmp_path / "out"
+    for name, frames in (("left", "1001-1003"), ("right", "1001")):
+        assert run(capsys, "denoise", shot_folder, "-o", out / f"{name}.####.exr", *DRAFT, "--frames", frames)[0] == 0
+    victim = shot_folder / "shot.1002.exr"
+    victim.write_bytes(victim.read_bytes()[:-2000])
+    assert run(capsys, "denoise", shot_folder, "-o", out / "right.####.exr", *DRAFT, "--frames", "1001-1003")[0] == 1
+    code, text, _ = run(capsys, "status", out)
+    assert code == 1
+    left, right = text.split("right", 1)
+    assert left.startswith("left")
+    assert "finished: 3 of 3 frames, 1001-1003" in left
+    assert "failed: 1 of 3 frames, 1001" in right
+    assert "not tried: 2 of 3 frames, 1002-1003: the run ended: " in right
+    assert run(capsys, "status", out / "other.####.exr")[2].endswith(
+        "no records of other, expected one of left, right\n"
+    )
 
 
 @pytest.mark.parametrize(
