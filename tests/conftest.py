@@ -16,10 +16,13 @@ for _name in ("COLUMNS", "LINES", "FORCE_COLOR", "NO_COLOR", "PY_COLORS"):
     os.environ.pop(_name, None)
 os.environ["TERM"] = "xterm"
 
+import argparse
+import re
 import shutil
 import signal
 import sys
 import tempfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -29,12 +32,30 @@ import pytest
 from tests.scenes import Scene
 
 
+def parse_part(text: str) -> tuple[int, int]:
+    """K and N of "K/N"."""
+    found = re.fullmatch(r"(\d{1,4})/(\d{1,4})", text)
+    if found is None or not 1 <= int(found[1]) <= int(found[2]):
+        raise argparse.ArgumentTypeError(f"part is {text!r}, expected K/N, where 1 <= K <= N")
+    return int(found[1]), int(found[2])
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--part", type=parse_part, default=(1, 1), metavar="K/N", help="the K-th of N parts of the tests")
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the tests of reliability unless `-m` names them; skip what needs POSIX on Windows."""
-    if "reliability" not in config.option.markexpr:
-        many = {item for item in items if item.get_closest_marker("reliability")}
-        config.hook.pytest_deselected(items=list(many))
-        items[:] = [item for item in items if item not in many]
+    """Leave out the tests of reliability unless `-m` names them, and other parts; skip what needs POSIX on Windows."""
+    number, count = config.getoption("part")
+    asked = "reliability" in config.option.markexpr
+
+    def taken(item: pytest.Item) -> bool:
+        """By a hash of its name, which is the same in every process and on every machine."""
+        marked = item.get_closest_marker("reliability") is not None
+        return (asked or not marked) and zlib.crc32(item.nodeid.encode()) % count == number - 1
+
+    config.hook.pytest_deselected(items=[item for item in items if not taken(item)])
+    items[:] = [item for item in items if taken(item)]
     for item in items:
         if sys.platform == "win32" and item.get_closest_marker("posix"):
             item.add_marker(pytest.mark.skip(reason="needs POSIX: pipes, signals, links or shells"))
