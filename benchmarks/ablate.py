@@ -32,7 +32,7 @@ STAGES = (
     "demodulate",
 )  # fmt: skip
 align, stabilize, samples = hybrid.alignment.align, hybrid.stabilize, nlm.samples
-_stillness, _trust_light, _means = stabilize.measure_stillness, align.trust_light, samples._MEANS
+_stillness, _combine, _means = stabilize.measure_stillness, align.combine_confidence, samples._MEANS
 
 
 def _ones(estimates: Any, *_: Any) -> Any:
@@ -55,7 +55,7 @@ def _first(picture: Any, *_: Any) -> Any:
 RULES: dict[str, tuple[Any, str, Any]] = {
     "agreement": (align, "agreement_weight", _ones),
     "interpolation": (align, "interpolation_weight", _nothing),
-    "outlines agree": (align, "trust_light", lambda *a, **k: _trust_light(*a, **{**k, "agreeing": 0.0})),
+    "outlines agree": (align, "combine_confidence", lambda *a, **k: _combine(*a, **{**k, "least": 0.0})),
     "relight": (align, "relight", _nothing),
     "stillness": (stabilize, "measure_stillness", lambda weight, shape: _stillness(None, shape)),
     "finished detail": (align, "FINISHED_DETAIL", None),

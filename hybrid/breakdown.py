@@ -63,9 +63,10 @@ def stage_layers(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:
     exposure).
     """
     assert aligned.geometric_confidence is not None
-    sides = [i for i, trust in enumerate(aligned.geometric_confidence) if i != aligned.centre and trust.any()]
+    sides = [i for i, own in enumerate(aligned.geometric_confidence) if i != aligned.middle and own.any()]
     mean = average(aligned.color if aligned.first_pass is None else aligned.first_pass, aligned.confidence)
-    changed = np.abs(irradiance - mean).mean(axis=-1) / (np.maximum(mean, 0).mean(axis=-1) + aligned.exposure)
+    light = np.maximum(mean, 0).mean(axis=-1) + aligned.brightness.exposure
+    changed = np.abs(irradiance - mean).mean(axis=-1) / light
     nothing = np.zeros(irradiance.shape[:2], np.float32)
     return {
         "stage.align": aligned.geometric_confidence[sides].mean(axis=0) if sides else nothing,

@@ -67,7 +67,7 @@ def filter_window(
                 # Edges of shadows and highlights are in no guide, but in the result of the non-local means. Without
                 # this channel the filter lost 2 dB on a sunlit shot.
                 light = irradiance.mean(axis=-1, keepdims=True)
-                guides.append(compress(light, aligned.exposure))
+                guides.append(compress(light, aligned.brightness.exposure))
             if guides:
                 guide = np.concatenate(guides, axis=-1)
                 irradiance = guided_filter(
@@ -75,7 +75,7 @@ def filter_window(
                     guide,
                     radius=preset.guided_radius,
                     eps=preset.guided_eps,
-                    moments=aligned.moments[:, : guide.shape[-1]],
+                    moments=aligned.brightness.moments[:, : guide.shape[-1]],
                 )
     return irradiance * aligned.modulation
 
@@ -103,11 +103,11 @@ def pool_and_denoise(aligned: AlignedWindow) -> Array:
     noisy image is then regressed on their difference) takes a third run of OIDN, and was worth 0.05 dB less than the
     constant on thirteen shots.
     """
-    if aligned.centre_first_pass is None:
+    if aligned.centre.first_pass is None:
         raise ValueError("aligned: expected a window with estimates, got none")
     pooled = aligned.pool()
     mean = pooled.average * aligned.modulation
-    albedo, normal = aligned.guides.get("albedo"), aligned.guides.get("normal")
+    albedo, normal = aligned.centre.guides.get("albedo"), aligned.centre.guides.get("normal")
     noisy_guides = "prefilter" in aligned.stages
     denoised = denoise_oidn(
         np.maximum(pooled.image * aligned.modulation, 0),
@@ -115,6 +115,6 @@ def pool_and_denoise(aligned: AlignedWindow) -> Array:
         None if albedo is None else normal,  # OIDN accepts no normal alone
         prefilter="balanced" if noisy_guides else None,
         clean=not noisy_guides,
-        scale=measure_gain(aligned.centre_first_pass),
+        scale=measure_gain(aligned.centre.first_pass),
     )
     return np.asarray(mean + np.float32(SECOND_LOOK) * (denoised - mean), np.float32)

@@ -16,7 +16,7 @@ from hybrid.alignment.align import align, align_results, measure_stillness
 from hybrid.alignment.prepare import ALPHA, PreparedFrame
 from hybrid.alignment.transfer import measure_typical_exposure
 from hybrid.alignment.unfiltered import as_gray
-from hybrid.alignment.window import AlignedWindow, Trust, Window
+from hybrid.alignment.window import AlignedWindow, Geometry, Window
 from hybrid.files.frame import Frame
 from hybrid.plan import Plan
 from hybrid.stream import FrameStream
@@ -33,7 +33,7 @@ Mask = NDArray[np.bool_]
 # By how much a pixel may change at most where results are averaged; and where samples correct a pixel that has parts,
 # which change with it, so that the color is the same with and without them but where it was next to nothing.
 MOST, CORRECTED = 2.0, 1e4
-# Layers of the trust in the frame before, and of that in the frame after.
+# Kinds of layers: the geometry of the frame before, and of the frame after.
 NEIGHBOURS = "before", "after"
 
 
@@ -80,21 +80,18 @@ class WindowResult:
     plan: Plan  # the stages that ran on the window
     # the samples of the other frames at the centre's pixels; with the stage "blend-samples"
     neighbour_samples: SampleMean | None
-    trust: tuple[Trust | None, ...]  # in the frames before and after; empty of `as_neighbour`
-    drift_weight: Array | None  # (H, W): as `AlignedWindow.drift_weight`
+    geometry: tuple[Geometry | None, ...]  # of the frames before and after; empty of `as_neighbour`
+    drift_weight: Array | None  # (H, W): as `hybrid.alignment.window.Neighbours.drift_weight`
     exposure: float  # of the centre's irradiance as rendered, or of the nearest frame with light
     brightest: float  # the greatest mean radiance of the frames of the window
     excess: Excess | None  # of the centre; with "blend-samples"
     passing: Excess | None  # the same over the neighbours' samples, where these are darker than the picture
-    # as `AlignedWindow` has them, over all bands
-    repaired: int
-    fireflies: int
-    outliers: int
+    outliers: int  # rejected in the window
 
     def as_neighbour(self) -> Self:
         """The result without what only the average of its own frame reads."""
         alone = Denoised(self.denoised.color)
-        return replace(self, denoised=alone, neighbour_samples=None, trust=(), drift_weight=None)
+        return replace(self, denoised=alone, neighbour_samples=None, geometry=(), drift_weight=None)
 
 
 @dataclass(frozen=True)
@@ -107,10 +104,9 @@ class FrameResult:
     # mean radiance of the noisy frame without its fireflies, and the mean radiance of these
     mean: float
     removed_radiance: float
-    # as for `WindowResult`
-    repaired: int
-    fireflies: int
-    outliers: int
+    repaired: int  # pixels that were not finite
+    fireflies: int  # single bright samples that were removed
+    outliers: int  # samples of the window that were rejected as fireflies
     beyond: int  # values beyond the range of half floats
 
 
@@ -151,7 +147,7 @@ class FrameDenoiser:
         # The frame before keeps only what the average reads.
         self._results = {n: _needed(result, n >= number) for n, result in self._results.items() if n in averaged}
         for n in averaged:
-            if n not in self._results or (n == number and not self._results[n].trust):
+            if n not in self._results or (n == number and not self._results[n].geometry):
                 self.stream.keep({*self.stream.around(n, self.stream.support), *averaged})
                 try:
                     self._results[n] = self.stream.keeper.keep(_needed(self._denoise_window(n), n >= number))
@@ -183,8 +179,8 @@ class FrameDenoiser:
             tuple(sorted(self._results)),
             0.0 if frame is None else frame.mean,
             0.0 if frame is None else frame.removed_radiance,
-            result.repaired,
-            result.fireflies,
+            0 if frame is None else frame.repaired,
+            0 if frame is None else frame.fireflies,
             result.outliers,
             beyond,
         )
@@ -204,6 +200,7 @@ class FrameDenoiser:
             brightest = brightest if there is None else max(brightest, there.mean)
             stream.keeper.release()  # a mean reads the whole frame
         exposure, bands = window.lit.as_rendered.exposure, self._bands()
+        shares = {"refine": float(np.mean(window.refined))} if window.refined else {}
         layers = _Layers(stream.shot.shape, stream.keeper.empty)
         outliers = 0
         stream.keeper.trim()
@@ -218,15 +215,14 @@ class FrameDenoiser:
             denoised = self.denoise(aligned)
             outliers += aligned.outliers
             named: dict[tuple[str, str], NDArray[Any] | None]
-            named = {("color", ""): denoised.color, ("drift", ""): aligned.drift_weight}
+            named = {("color", ""): denoised.color, ("drift", ""): aligned.neighbours.drift_weight}
             named |= {("aovs", name): layer for name, layer in denoised.aovs.items()}
             named |= {("extra", name): layer for name, layer in denoised.extra.items()}
-            groups = aligned.neighbour_samples, *aligned.neighbour_trust
+            groups = aligned.neighbours.samples, *aligned.neighbours.geometry
             for kind, group in zip(("sides", *NEIGHBOURS), groups, strict=True):
                 named |= {} if group is None else {(kind, name): layer for name, layer in group._asdict().items()}
             layers.add(band, aligned.inner, named)
-            shares, parts = aligned.shares, denoised.parts
-            repaired, fireflies = aligned.repaired, aligned.fireflies
+            parts = denoised.parts
             del aligned, denoised, named  # before the next band is aligned
             stream.keeper.trim()
         samples = layers.named("sides")
@@ -239,20 +235,19 @@ class FrameDenoiser:
             Denoised(color, layers.named("aovs"), layers.named("extra"), parts),
             replace(plan, shares=shares),
             SampleMean(**samples) if samples else None,
-            tuple(Trust(**found) if (found := layers.named(side)) else None for side in NEIGHBOURS),
+            tuple(Geometry(**found) if (found := layers.named(side)) else None for side in NEIGHBOURS),
             layers.named("drift").get(""),
             exposure,
             brightest,
             excess,
             passing,
-            repaired,
-            fireflies,
             outliers,
         )
 
     def _stabilize(self, number: int) -> Denoised:
         """The denoised frame averaged with its neighbours, and its parts changed alike."""
         result, timings = self._results[number], self.stream.timings
+        geometry, exposure = result.geometry, result.exposure
         colors = {n: other.denoised.color for n, other in self._results.items()}
         self.stream.keeper.trim()
         window = self.stream.window_of_results(number, colors)
@@ -260,7 +255,7 @@ class FrameDenoiser:
         with timings.stage("stabilize"):
             stillness = measure_stillness(result.drift_weight, color.shape[:2])
         for band in self._bands():
-            aligned, confidence = align_results(window, result.trust, stillness, result.exposure, band, timings=timings)
+            aligned, confidence = align_results(window, geometry, stillness, exposure, band, timings=timings)
             with timings.stage("stabilize"):
                 color[band] = average(aligned, confidence)
             self.stream.keeper.release()

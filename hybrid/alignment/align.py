@@ -1,6 +1,6 @@
 """Align a window of frames to its centre (`align`, for all filters and networks), and results to each other."""
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -9,10 +9,19 @@ import numpy as np
 from flow.confidence import GuideNoise, fill_uncovered, local_variance
 from flow.warp import warp
 from hybrid.alignment.guides import average_guides
-from hybrid.alignment.neighbour import layers_of, novelty_of, trust_geometry, trust_light, warp_layers
+from hybrid.alignment.neighbour import combine_confidence, confidence_by_geometry, novelty_of
 from hybrid.alignment.prepare import ALPHA, PreparedFrame
 from hybrid.alignment.transfer import demodulate, remodulate
-from hybrid.alignment.window import AlignedWindow, Trust, WarpSources, Window, clean_guide
+from hybrid.alignment.window import (
+    AlignedWindow,
+    Centre,
+    Geometry,
+    Neighbours,
+    WarpSources,
+    Window,
+    clean_guide,
+    warp_rows,
+)
 from hybrid.files.frame import Array
 from hybrid.files.layers import Layers
 from hybrid.runtime.timing import Timings
@@ -22,7 +31,7 @@ from nlm.gate import agreement_weight, color_gate, color_gates
 from nlm.interpolation import interpolation_weight, measure_noise
 from nlm.pooling import SampleRange
 from nlm.relight import relight
-from nlm.samples import SampleMean, average_neighbours
+from nlm.samples import average_neighbours
 
 # How much of a frame's noise finished pictures may differ by: up to the first as they are, up to the second without
 # their mean difference (`nlm.relight`), where the light stands still as far as samples show (`nlm.drift`). The second
@@ -43,22 +52,6 @@ STANDING = 0.2, 0.4
 # beyond, for 2e-7 of the light. Whole strips of the guided filter (64 rows): it then sums in the order it would in the
 # frame.
 MARGIN = 192
-
-
-class _Warped(NamedTuple):
-    """Layers of all frames warped to the centre, and how far geometry trusts each."""
-
-    layers: dict[str, Array]  # (T, h, W, C) each
-    confidence: Array  # (T, h, W)
-    trust: tuple[Trust | None, ...]
-
-
-class _Trusted(NamedTuple):
-    """How far geometry and light trust each frame, and how far its light drifts."""
-
-    confidence: Array  # (T, h, W)
-    pull: Array | None = None  # (T, h, W): weights by which first passes are pulled to the centre's; None without drift
-    drift_weight: Array | None = None  # (h, W): as `AlignedWindow.drift_weight`
 
 
 class Stillness(NamedTuple):
@@ -83,102 +76,118 @@ def align(
     guided: bool = True,
     timings: Timings | None = None,
 ) -> AlignedWindow:
-    """Warp all frames of a window to its centre, and measure how far each pixel can be trusted.
+    """Warp all frames of a window to its centre, and measure the confidence in each pixel.
 
     With `rows` only these rows of the frame, and `MARGIN` around them. With `ranged` the range of the samples is found
     while they are averaged; without `guided` only the filter of AOVs reads `AlignedWindow.guide`. All frames have
     the same layers (`expect_equal_layers`). Raises ValueError if the centre has no first pass and others do.
     """
     timings = timings or Timings()
-    centre, stages, denoised = window.centre, window.stages, window.first_pass is not None
-    middle = len(window.frames) // 2
-    padded, inner = _pad_rows(rows, len(centre.irradiance))
-    light = "gate" in stages and not denoised
-    layers = {name: layer[padded] for name, layer in layers_of(centre, light=light, alpha="alpha" in stages).items()}
-    guides = {name: layer for name, layer in layers.items() if name in ("albedo", "normal")}
-    # With a first pass few denoisers read the colors of all frames: these are warped when they are read.
-    centre_irradiance = layers.pop("color") if denoised else layers["color"]
-    warped, coverage = _warp_neighbours(window, layers, guides, padded, timings)
-    flows = [None if link is None else link.forward.vectors[padded] for link in window.links]
-    sources = WarpSources(window.frames, flows, window.first_pass or (), window.limited, padded, release=window.release)
-    with timings.stage("confidence"):
-        # Before the first pass is warped, whose place in memory the guide of all frames has until then.
-        clean = clean_guide("albedo", guides, sources, warped.confidence, stages) if "albedo" in guides else None
-        filtered = None
-        if window.filtered_guides is not None:
-            filtered = average_guides(window.filtered_guides, flows, warped.confidence, padded)
-    # The first passes of all frames, or their colors.
+    padded, inner = _pad_rows(rows, len(window.centre.irradiance))
     if window.first_pass is None:
-        pictures = warped.layers.pop("color")
+        aligned = _align_noisy(window, padded, inner, timings)
     else:
-        pictures, exact = _warp_first_pass(window, window.first_pass, coverage, padded, timings)
+        aligned = _align_denoised(window, window.first_pass, padded, inner, ranged, timings)
+    if guided or window.centre.aovs:
+        return aligned
+    return replace(aligned, centre=replace(aligned.centre, clean_albedo=None), geometric_confidence=None)
+
+
+def _align_noisy(window: Window, rows: slice, inner: slice, timings: Timings) -> AlignedWindow:
+    """Align noisy frames.
+
+    The confidence in a pixel of a neighbour is that by geometry, times the gate, which compares rough light.
+    """
+    stages, middle = window.stages, len(window.frames) // 2
+    gated = "gate" in stages
+    names = ("irradiance", "light") if gated else ("irradiance",)
+    aligned, pictures, _ = _align_by_geometry(window, names, rows, inner, timings)
     with timings.stage("confidence"):
-        centre_irradiance = _fill_centre(warped, pictures, centre_irradiance, sources)
-        bright = window.lit.as_light if "light" in warped.layers else window.lit.as_rendered
-        outliers = 0
-        if not denoised and "outliers" in stages:
-            pictures, rejected = reject_outliers(pictures, warped.confidence)
-            centre_irradiance, outliers = pictures[middle], int(np.count_nonzero(rejected[:, inner]))
-        modulation = np.ones_like(centre_irradiance)
-        if clean is not None and centre.demodulated:
-            modulation = remodulate(modulation, clean)
-            if "prefilter" in stages:
-                sources = replace(sources, modulation=modulation)
-        guided = guided or bool(centre.aovs)
-        clean = clean if guided else None
-        if denoised:
-            # By the centre's albedo and not by each frame's own, which may be noisy as the first pass is not.
-            pictures /= modulation
-            gate = color_gate(pictures, centre_irradiance, bright.exposure)
-            confidence = trust_light(warped.confidence, coverage, gate, stages)
-            del coverage, gate  # windows are large
-            for trust, weight in zip(confidence, exact, strict=True):
-                if weight is not None:
-                    trust *= weight
-            trusted = _trust_denoised(window, pictures, centre_irradiance, confidence, bright.exposure, padded.start)
-        else:
-            trusted = _trust_noisy(warped, centre_irradiance, bright.exposure, stages)
-        sides = found = None
+        _fill_centre([*pictures.values(), *aligned.aovs.values()], aligned.confidence)
+        color, outliers = pictures.pop("irradiance"), 0
+        if "outliers" in stages:
+            color, rejected = reject_outliers(color, aligned.confidence)
+            outliers = int(np.count_nonzero(rejected[:, inner]))
+        confidence = aligned.confidence
+        if gated:
+            confidence = confidence * color_gate(pictures["light"], color[middle], aligned.brightness.exposure)
+        samples = None
         if "blend-samples" in stages:
-            found = SampleRange.empty(centre_irradiance.shape) if ranged and denoised else None
-            sides = _average_samples(sources, pictures, warped.confidence, trusted, modulation, centre, found)
-        elif trusted.pull is not None:
-            pull_to_centre(pictures, trusted.confidence, trusted.pull)
-    return AlignedWindow(
-        number=centre.number,
-        centre_irradiance=centre_irradiance,
-        aligned_color=None if denoised else pictures,
-        guides=guides,
-        sources=sources,
-        confidence=trusted.confidence,
-        modulation=modulation,
-        clean_albedo=clean,
-        geometric_confidence=warped.confidence if guided else None,
-        rendered_variance=centre.variance,
-        first_pass=pictures if denoised else None,
-        centre_first_pass=None if window.first_pass is None else window.first_pass[middle],
-        aovs={name.removeprefix("aov "): layer for name, layer in warped.layers.items() if name.startswith("aov ")},
-        repaired=centre.repaired,
+            noisy = window.centre.radiance[rows]
+            samples = average_neighbours(color, None, confidence, aligned.confidence, aligned.modulation, noisy)
+    return replace(
+        aligned,
+        centre=replace(aligned.centre, irradiance=color[middle]),
+        neighbours=replace(aligned.neighbours, samples=samples),
+        confidence=confidence,
+        aligned_color=color,
         outliers=outliers,
-        fireflies=centre.fireflies,
-        exposure=bright.exposure,
-        moments=bright.moments,
-        inner=inner,
-        stages=stages,
-        shares={"refine": float(np.mean(window.refined))} if window.refined else {},
-        pass_colors={name: tint[padded] for name, tint in centre.pass_colors.items()},
-        neighbour_samples=sides,
-        neighbour_trust=(warped.trust[middle - 1], warped.trust[middle + 1]) if middle else (None, None),
-        known_range=found,
-        drift_weight=trusted.drift_weight,
-        passes=centre.passes,
-        filtered_guides=filtered,
+    )
+
+
+def _align_denoised(
+    window: Window, first_pass: Sequence[Array | None], rows: slice, inner: slice, ranged: bool, timings: Timings
+) -> AlignedWindow:
+    """Align frames that have a first pass.
+
+    The confidence in a pixel of a neighbour is that by geometry, combined with the gate, which compares first passes,
+    times the weight by interpolation, times the agreement of all neighbours. First passes that drift are pulled to the
+    centre's.
+    """
+    stages, middle = window.stages, len(window.frames) // 2
+    # Few denoisers read the colors of all frames: these are warped when they are read.
+    aligned, _, coverage = _align_by_geometry(window, (), rows, inner, timings)
+    sources, irradiance, exposure = aligned.sources, aligned.centre.irradiance, aligned.brightness.exposure
+    filtered_guides = None
+    if window.filtered_guides is not None:
+        with timings.stage("confidence"):
+            filtered_guides = average_guides(window.filtered_guides, sources.flows, aligned.confidence, rows)
+    estimates, interpolation = _warp_first_pass(window, first_pass, coverage, rows, timings)
+    with timings.stage("confidence"):
+        pictures, complete = [estimates, *aligned.aovs.values()], aligned.confidence[middle].all()
+        if not complete:
+            pictures.append(sources.warp("irradiance", irradiance))
+        _fill_centre(pictures, aligned.confidence)
+        irradiance = irradiance if complete else pictures[-1][middle].copy()
+        # By the centre's albedo and not by each frame's own, which may be noisy as the first pass is not.
+        estimates /= aligned.modulation
+        gate = color_gate(estimates, irradiance, exposure)
+        confidence = combine_confidence(aligned.confidence, coverage, gate, stages)
+        del coverage, gate, pictures  # windows are large
+        for own, weight in zip(confidence, interpolation, strict=True):
+            if weight is not None:
+                own *= weight
+        if "gate" in stages:
+            agreement = agreement_weight(estimates, irradiance, confidence, exposure)
+            confidence[:middle] *= agreement
+            confidence[middle + 1 :] *= agreement
+        pull = drift_weight = samples = known_range = None
+        if "drift" in stages:
+            pull = drift_weights(estimates, irradiance, confidence, exposure, first_row=rows.start)
+            # A copy: a view would keep the weights of all frames in memory.
+            drift_weight = pull[middle + 1].copy() if _shows_drift(window) else None
+        if "blend-samples" in stages:
+            known_range = SampleRange.empty(irradiance.shape) if ranged else None
+            strips = _pull_behind(sources.residual_strips(), estimates, confidence, pull, known_range)
+            noisy = window.centre.radiance[rows]
+            samples = average_neighbours(estimates, strips, confidence, aligned.confidence, aligned.modulation, noisy)
+        elif pull is not None:
+            pull_to_centre(estimates, confidence, pull)
+    return replace(
+        aligned,
+        centre=replace(
+            aligned.centre, irradiance=irradiance, filtered_guides=filtered_guides, first_pass=first_pass[middle]
+        ),
+        neighbours=replace(aligned.neighbours, samples=samples, drift_weight=drift_weight),
+        confidence=confidence,
+        first_pass=estimates,
+        known_range=known_range,
     )
 
 
 def align_results(
     window: Window,
-    trust: Sequence[Trust | None],
+    geometry: Sequence[Geometry | None],
     stillness: Stillness,
     exposure: float,
     rows: slice | None = None,
@@ -187,9 +196,10 @@ def align_results(
 ) -> tuple[Array, Array]:
     """Align the results of a frame and its two neighbours, and measure how far they show the same.
 
-    `window` holds three frames with their results in the place of a first pass, `trust` is that in the two neighbours
-    for the whole frame, `exposure` that of the centre's irradiance as rendered, `rows` as for `align`. Returns radiance
-    (3, h, W, 3) in the centre's light, its own where a frame shows or has none, and a confidence (3, h, W) in [0, 1].
+    `window` holds three frames with their results in the place of a first pass, `geometry` is that of the two
+    neighbours for the whole frame, `exposure` that of the centre's irradiance as rendered, `rows` as for `align`.
+    Returns radiance (3, h, W, 3) in the centre's light, its own where a frame shows or has none, and a confidence
+    (3, h, W) in [0, 1].
     """
     timings = timings or Timings()
     centre, stages = window.centre, window.stages
@@ -198,10 +208,10 @@ def align_results(
     shape = len(window.frames), *noisy.shape[:2]
     confidence, coverage = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     confidence[1] = coverage[1] = centre.valid[padded]
-    for index, known in zip((0, 2), trust, strict=True):
-        if known is not None and window.frames[index] is not None and window.links[index] is not None:
-            here = Trust(known.coverage[padded], known.confidence[padded])
-            _set_trust(confidence, coverage, window, index, here, padded)
+    for index, frame in zip((0, 2), geometry, strict=True):
+        if frame is not None and window.frames[index] is not None and window.links[index] is not None:
+            coverage[index], confidence[index] = frame.coverage[padded], frame.confidence[padded]
+            _count_own_samples(window, index, padded, coverage[index], confidence[index])
     assert window.first_pass is not None
     results, _ = _warp_first_pass(window, window.first_pass, coverage, padded, timings, weigh=False)
     with timings.stage("stabilize"):
@@ -210,7 +220,7 @@ def align_results(
         # Outlines are as geometry has them: finished ones are sharp, and their mean over frames is not. On the
         # bundled shot with its chrome that is worth 0.4 dB.
         gates = color_gates(light, noisy, exposure, FINISHED, floor=FINISHED_FLOOR, detail=FINISHED_DETAIL)
-        alike, confidence = (trust_light(confidence, coverage, gate, stages, agreeing=0.0) for gate in gates)
+        alike, confidence = (combine_confidence(confidence, coverage, gate, stages, least=0.0) for gate in gates)
         local = stillness.local[padded]
         confidence -= alike
         confidence *= local
@@ -263,50 +273,81 @@ def _names(frame: PreparedFrame) -> set[str]:
     return {name for name, layer in given.items() if layer is not None}
 
 
-def _warp_neighbours(
-    window: Window, layers: dict[str, Array], guides: Collection[str], rows: slice, timings: Timings
-) -> tuple[_Warped, Array]:
-    """Warp the neighbours' layers to these rows of the centre. Guides serve the confidence alone and are not kept.
+def _align_by_geometry(
+    window: Window, names: Sequence[str], rows: slice, inner: slice, timings: Timings
+) -> tuple[AlignedWindow, dict[str, Array], Array]:
+    """Align a window by geometry alone, with these pictures (T, h, W, 3) of all frames; no light is compared.
 
     With the coverage (T, h, W), an upper bound of the confidence: 0 where a frame shows nothing.
     """
-    centre, count = window.centre, len(window.frames)
+    centre, count, stages = window.centre, len(window.frames), window.stages
     shape = count, rows.stop - rows.start, centre.irradiance.shape[1]
-    kept = {n: np.empty((*shape, layer.shape[-1]), np.float32) for n, layer in layers.items() if n not in guides}
+
+    def layers_of(frame: PreparedFrame) -> list[Array]:
+        alpha = [frame.alpha] if "alpha" in stages and frame.alpha is not None else []
+        return [*(getattr(frame, name) for name in names), *(frame.aovs[name] for name in centre.aovs), *alpha]
+
+    own = layers_of(centre)
+    warped = [np.empty((*shape, layer.shape[-1]), np.float32) for layer in own]
+    given = {"albedo": centre.albedo, "normal": centre.normal}
+    guides = {name: guide[rows] for name, guide in given.items() if guide is not None}
     confidence, coverage = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    trusts: list[Trust | None] = [None] * count
+    geometry: list[Geometry | None] = [None] * count
     with timings.stage("confidence"):
         noise = None
         if any(window.outline_noise):
-            noise = GuideNoise(local_variance(layers.get("albedo"), layers.get("normal")), window.outline_noise)
-    for index, (there, link) in enumerate(zip(window.frames, window.links, strict=True)):
-        if there is None or link is None:
+            noise = GuideNoise(local_variance(guides.get("albedo"), guides.get("normal")), window.outline_noise)
+    for index, (frame, link) in enumerate(zip(window.frames, window.links, strict=True)):
+        if frame is None or link is None:
             # The centre itself, or a frame that is missing.
-            for name, layer in kept.items():
-                layer[index] = layers[name]
+            for out, layer in zip(warped, own, strict=True):
+                out[index] = layer[rows]
             if index == count // 2:
                 confidence[index] = coverage[index] = centre.valid[rows]
             continue
         with timings.stage("warp"):
-            warp_layers(there, link.forward.vectors[rows], rows, {name: layer[index] for name, layer in kept.items()})
-            trust = trusts[index] = trust_geometry(layers, there, link, rows, noise)
-            _set_trust(confidence, coverage, window, index, trust, rows)
+            for out, layer in zip(warped, layers_of(frame), strict=True):
+                warp_rows(layer, link.forward.vectors[rows], rows.start, out[index])
+            found = geometry[index] = confidence_by_geometry(guides, frame, link, rows, noise)
+            coverage[index], confidence[index] = found
+            _count_own_samples(window, index, rows, coverage[index], confidence[index])
         window.release()
-    return _Warped(kept, confidence, tuple(trusts)), coverage
+    flows = [None if link is None else link.forward.vectors[rows] for link in window.links]
+    sources = WarpSources(window.frames, flows, window.first_pass or (), window.limited, rows, release=window.release)
+    modulation, clean_albedo = np.ones((*shape[1:], 3), np.float32), None
+    with timings.stage("confidence"):
+        if "albedo" in guides:
+            clean_albedo = clean_guide("albedo", guides, sources, confidence, stages)
+            if centre.demodulated:
+                modulation = remodulate(modulation, clean_albedo)
+                sources = replace(sources, modulation=modulation if "prefilter" in stages else None)
+        brightness = window.lit.as_light if "light" in names else window.lit.as_rendered
+    aligned = AlignedWindow(
+        centre=Centre(centre, centre.irradiance[rows], guides, clean_albedo),
+        neighbours=Neighbours((geometry[count // 2 - 1], geometry[count // 2 + 1]) if count > 1 else (None, None)),
+        sources=sources,
+        stages=stages,
+        inner=inner,
+        confidence=confidence,
+        geometric_confidence=confidence,
+        modulation=modulation,
+        brightness=brightness,
+        aovs=dict(zip([*centre.aovs, ALPHA], warped[len(names) :], strict=False)),
+    )
+    return aligned, dict(zip(names, warped, strict=False)), coverage
 
 
-def _set_trust(confidence: Array, coverage: Array, window: Window, index: int, trust: Trust, rows: slice) -> None:
-    """Write a neighbour's confidence and coverage, as far as its samples count beside the centre's."""
-    coverage[index], confidence[index] = trust
-    if window.samples[index] < 1:
-        coverage[index] *= window.samples[index]
-        confidence[index] *= window.samples[index]
+def _count_own_samples(window: Window, index: int, rows: slice, coverage: Array, confidence: Array) -> None:
+    """Reduce the coverage and the confidence (h, W) of a neighbour, in place, to what its samples add to the centre."""
+    link = window.links[index]
+    factors: list[Array | np.float32] = [window.samples[index]]
     if window.repeated[index]:  # a frame nearer to the centre has the same samples
-        coverage[index] = confidence[index] = 0
-    elif "fixed-noise" in window.stages and (link := window.links[index]) is not None:
-        novelty = novelty_of(link.forward.vectors[rows])
-        coverage[index] *= novelty
-        confidence[index] *= novelty
+        factors = [np.float32(0)]
+    elif "fixed-noise" in window.stages and link is not None:
+        factors.append(novelty_of(link.forward.vectors[rows]))
+    for factor in factors:
+        coverage *= factor
+        confidence *= factor
 
 
 def _warp_first_pass(
@@ -328,8 +369,8 @@ def _warp_first_pass(
     warped = np.empty((len(first_pass), *middle[rows].shape), np.float32)
     weights: list[Array | None] = [None] * len(first_pass)
     noise = measure_noise(window.centre.radiance[rows], middle[rows]) if weigh else None
-    for index, (there, link) in enumerate(zip(first_pass, window.links, strict=True)):
-        if link is None or there is None:
+    for index, (picture, link) in enumerate(zip(first_pass, window.links, strict=True)):
+        if link is None or picture is None:
             warped[index] = middle[rows]
             if link is not None:
                 coverage[index] = 0
@@ -337,62 +378,26 @@ def _warp_first_pass(
         with timings.stage("warp"):
             # Denoised frames have no noise that interpolation could average, only detail to lose: bicubic is worth up
             # to 0.5 dB here.
-            flow = link.forward.vectors
-            if flow.any():
-                warp(there, flow[rows], interpolation="bicubic", first_row=rows.start, out=warped[index])
-                if noise is not None:
-                    bilinear, _ = warp(there, flow[rows], first_row=rows.start)
-                    weights[index] = interpolation_weight(warped[index], bilinear, noise)
-            else:
-                warped[index] = there[rows]
+            flow = link.forward.vectors[rows]
+            warp_rows(picture, flow, rows.start, warped[index], interpolation="bicubic")
+            if noise is not None and link.forward.vectors.any():
+                bilinear, _ = warp(picture, flow, first_row=rows.start)
+                weights[index] = interpolation_weight(warped[index], bilinear, noise)
             fill_uncovered(warped[index], middle[rows], coverage[index])
         window.release()
     return warped, weights
 
 
-def _trust_noisy(warped: _Warped, centre_irradiance: Array, exposure: float, stages: Collection[str]) -> _Trusted:
-    """Combine geometry with the gate by the frames' rough light, without a first pass."""
-    if "gate" not in stages:
-        return _Trusted(warped.confidence)
-    return _Trusted(warped.confidence * color_gate(warped.layers["light"], centre_irradiance, exposure))
+def _fill_centre(pictures: Iterable[Array], confidence: Array) -> None:
+    """Fill pixels of the centre without a finite color, in place, by the mean of pictures (T, h, W, C) over time.
 
-
-def _trust_denoised(
-    window: Window,
-    first_pass: Array,
-    centre_irradiance: Array,
-    confidence: Array,
-    exposure: float,
-    first_row: int,
-) -> _Trusted:
-    """Multiply the confidence, in place, by the agreement of all neighbours, and measure drift."""
-    stages, middle = window.stages, len(first_pass) // 2
-    if "gate" in stages:
-        agreement = agreement_weight(first_pass, centre_irradiance, confidence, exposure)
-        confidence[:middle] *= agreement
-        confidence[middle + 1 :] *= agreement
-    if "drift" not in stages:
-        return _Trusted(confidence)
-    weight = drift_weights(first_pass, centre_irradiance, confidence, exposure, first_row=first_row)
-    # A copy: a view would keep the weights of all frames in memory.
-    return _Trusted(confidence, weight, weight[middle + 1].copy() if _shows_drift(window) else None)
-
-
-def _average_samples(
-    sources: WarpSources,
-    pictures: Array,
-    geometry: Array,
-    trusted: _Trusted,
-    modulation: Array,
-    centre: PreparedFrame,
-    found: SampleRange | None,
-) -> SampleMean:
-    """Average the neighbours' samples; pull first passes to the centre's, and add them with the samples to `found`."""
-    residuals = None
-    if sources.first_pass:
-        residuals = _pull_behind(sources.residual_strips(), pictures, trusted.confidence, trusted.pull, found)
-    noisy = centre.radiance[sources.rows]
-    return average_neighbours(pictures, residuals, trusted.confidence, geometry, modulation, noisy)
+    The neighbours in space fill a single pixel well, a block badly: those in time come first.
+    """
+    middle = len(confidence) // 2
+    gone = confidence[middle] == 0
+    if gone.any():
+        for picture in pictures:
+            picture[middle][gone] = average(picture, confidence)[gone]
 
 
 def _pull_behind(
@@ -400,7 +405,7 @@ def _pull_behind(
     estimates: Array,
     confidence: Array,
     weight: Array | None,
-    found: SampleRange | None,
+    samples: SampleRange | None,
 ) -> Iterator[tuple[int, Array]]:
     """Yield strips of residuals; when one has been used, pull its estimates to the centre's and add to the range.
 
@@ -410,28 +415,8 @@ def _pull_behind(
         yield top, strip
         if weight is not None:
             pull_to_centre(estimates, confidence, weight, slice(top, top + strip.shape[1]))
-        if found is not None:
-            found.add(estimates, strip, top)
-
-
-def _fill_centre(warped: _Warped, pictures: Array, centre_irradiance: Array, sources: WarpSources) -> Array:
-    """Fill pixels of the centre without a finite color from the neighbours in time; return its irradiance.
-
-    `pictures` are first passes where `sources` has these, else the colors.
-    """
-    denoised, middle = bool(sources.first_pass), len(pictures) // 2
-    gone = warped.confidence[middle] == 0
-    if gone.any():
-        # The neighbours in space fill a single pixel well, a block badly: those in time come first.
-        centre_irradiance = centre_irradiance.copy()
-        centre_irradiance[gone] = average(
-            sources.warp("irradiance", centre_irradiance) if denoised else pictures, warped.confidence
-        )[gone]
-        for layer in (*warped.layers.values(), *([pictures] if denoised else [])):
-            layer[middle][gone] = average(layer, warped.confidence)[gone]
-    if not denoised:
-        pictures[middle] = centre_irradiance
-    return centre_irradiance
+        if samples is not None:
+            samples.add(estimates, strip, top)
 
 
 def _shows_drift(window: Window) -> bool:

@@ -29,7 +29,7 @@ def average_guides(
     -------
     dict of (h, W, 3) float32
         Σ c_t b_t g_t / Σ c_t b_t, with b_t = max(1 − 8 |f_t − round(f_t)|, 0) for the flow f_t, 1 for the centre, and
-        g_t sampled at the nearest pixel. The centre's where nothing is trusted.
+        g_t sampled at the nearest pixel. The centre's where that is 0.
 
     Notes
     -----
@@ -40,12 +40,13 @@ def average_guides(
     assert own is not None
     sums = {name: np.asarray(layer[rows], np.float32) * confidence[middle][..., None] for name, layer in own.items()}
     totals = {name: confidence[middle].copy() for name in own}
-    for there, flow, trust in zip(guides, flows, confidence, strict=True):
-        if there is None or flow is None:
+    for frame, flow, own_confidence in zip(guides, flows, confidence, strict=True):
+        if frame is None or flow is None:
             continue
         for name, total in totals.items():
-            layer = np.ascontiguousarray(there[name], np.float32)
-            run_bands(_add, len(total), layer, flow, np.ascontiguousarray(trust), rows.start, sums[name], total)
+            layer = np.ascontiguousarray(frame[name], np.float32)
+            given = layer, flow, np.ascontiguousarray(own_confidence), rows.start
+            run_bands(_add, len(total), *given, sums[name], total)
     for name, total in totals.items():
         known = (total > 0)[..., None]
         np.divide(sums[name], total[..., None], out=sums[name], where=known)
@@ -55,16 +56,16 @@ def average_guides(
 
 @njit(nogil=True, cache=True)
 def _add(
-    first: int, last: int, layer: Array, flow: Array, trust: Array, first_row: int, summed: Array, total: Array
+    first: int, last: int, layer: Array, flow: Array, confidence: Array, first_row: int, summed: Array, total: Array
 ) -> None:
     height, width, channels = layer.shape
     half, zero = np.float32(0.5), np.float32(0)
     for y in range(first, last):
         for x in range(width):
-            if not trust[y, x] > zero:
+            if not confidence[y, x] > zero:
                 continue
             place = locate(np.float32(x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1], width, height)
-            weight = trust[y, x] * weigh_whole(place.fx, place.fy)
+            weight = confidence[y, x] * weigh_whole(place.fx, place.fy)
             row = np.uintp(place.y1 if place.fy >= half else place.y0)
             column = np.uintp(place.x1 if place.fx >= half else place.x0)
             total[y, x] += weight

@@ -1,4 +1,4 @@
-"""Warp the layers of a neighbour to the centre of a window, and measure how far they can be trusted."""
+"""The confidence in the pixels of a neighbour: by geometry, by its motion where all frames have one seed, by light."""
 
 from collections.abc import Collection
 
@@ -6,10 +6,9 @@ import numpy as np
 from numba import njit
 
 from flow.confidence import GuideNoise, estimate_confidence, find_coverage
-from flow.warp import warp
 from hybrid.alignment.flows import Link
-from hybrid.alignment.prepare import ALPHA, PreparedFrame
-from hybrid.alignment.window import Trust
+from hybrid.alignment.prepare import PreparedFrame
+from hybrid.alignment.window import Geometry
 from hybrid.files.frame import Array
 from loops.parallel import run_bands
 
@@ -22,51 +21,27 @@ AGREEING = 0.3
 SAME_NOISE, OTHER_NOISE = 0.5, 1.5
 
 
-def layers_of(frame: PreparedFrame, *, light: bool = False, alpha: bool = False) -> dict[str, Array]:
-    """Layers of a frame that are warped, by name; with `light`, which is compared where there is no first pass."""
-    named = {
-        "color": frame.irradiance,
-        "light": frame.light if light else None,
-        "albedo": frame.albedo,
-        "normal": frame.normal,
-        **{f"aov {name}": layer for name, layer in frame.aovs.items()},
-        f"aov {ALPHA}": frame.alpha if alpha else None,
-    }
-    return {name: layer for name, layer in named.items() if layer is not None}
+def confidence_by_geometry(
+    guides: dict[str, Array], neighbour: PreparedFrame, link: Link, rows: slice, noise: GuideNoise | None
+) -> Geometry:
+    """Compare motion, albedo and normals of a neighbour with the centre's `guides` (h, W, 3) at these rows.
 
-
-def warp_layers(there: PreparedFrame, flow: Array, rows: slice, warped: dict[str, Array]) -> None:
-    """Warp a neighbour's `layers_of` to some rows of the centre, along their flow (h, W, 2), into `warped`."""
-    layers = layers_of(there, light="light" in warped, alpha=f"aov {ALPHA}" in warped)
-    moves = bool(warped) and flow.any()
-    for name, out in warped.items():
-        if moves:
-            warp(layers[name], flow, first_row=rows.start, out=out)
-        else:
-            out[...] = layers[name][rows]
-
-
-def trust_geometry(
-    centre: dict[str, Array], there: PreparedFrame, link: Link, rows: slice, noise: GuideNoise | None
-) -> Trust:
-    """Measure how far geometry trusts a neighbour at some rows of the centre, whose layers are `centre`.
-
-    `noise` is that of the centre's guides; None: they have none.
+    `noise` is that of the guides; None: they have none.
     """
     flow = link.forward.vectors[rows]
-    covered = find_coverage(flow, link.forward.valid[rows], there.valid, rows.start)
+    coverage = find_coverage(flow, link.forward.valid[rows], neighbour.valid, rows.start)
     confidence = estimate_confidence(
         flow,
-        inside=covered,
+        inside=coverage,
         reverse=link.backward.vectors,
-        albedo=centre.get("albedo"),
-        other_albedo=there.albedo,
-        normal=centre.get("normal"),
-        other_normal=there.normal,
+        albedo=guides.get("albedo"),
+        other_albedo=neighbour.albedo,
+        normal=guides.get("normal"),
+        other_normal=neighbour.normal,
         first_row=rows.start,
         noise=noise,
     )
-    return Trust(covered, confidence)
+    return Geometry(coverage, confidence)
 
 
 def novelty_of(flow: Array) -> Array:
@@ -75,23 +50,17 @@ def novelty_of(flow: Array) -> Array:
     return np.clip((distance - SAME_NOISE) / (OTHER_NOISE - SAME_NOISE), 0, 1)
 
 
-def trust_light(
-    confidence: Array,
-    coverage: Array,
-    gate: Array,
-    stages: Collection[str],
-    *,
-    agreeing: float = AGREEING,
+def combine_confidence(
+    geometric: Array, coverage: Array, gate: Array, stages: Collection[str], *, least: float = AGREEING
 ) -> Array:
-    """Combine confidence c, coverage and gate g, each (T, h, W): max(c g, coverage · agreeing · g).
+    """Combine confidence by geometry c, coverage and gate g, each (T, h, W): max(c g, coverage · least · g).
 
-    Without the stage "gate" c stands for c g. `agreeing` is the confidence that geometry leaves at least where the
-    light agrees.
+    Without the stage "gate" c stands for c g. `least` is the confidence that geometry leaves where the light agrees.
     """
-    trust = np.empty_like(confidence)
-    given = confidence, coverage, np.ascontiguousarray(gate), np.float32(agreeing), "gate" in stages
-    run_bands(_combine, trust.shape[1], *given, trust)
-    return trust
+    confidence = np.empty_like(geometric)
+    given = geometric, coverage, np.ascontiguousarray(gate), np.float32(least), "gate" in stages
+    run_bands(_combine, confidence.shape[1], *given, confidence)
+    return confidence
 
 
 @njit(cache=True, nogil=True)

@@ -1,7 +1,7 @@
 """A window of frames: the frames with the flows between them, and the same aligned to the centre."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import NamedTuple
 
@@ -10,11 +10,10 @@ import numpy as np
 from flow.confidence import mix_centre
 from flow.warp import warp
 from hybrid.alignment.flows import Link
-from hybrid.alignment.prepare import PreparedFrame
+from hybrid.alignment.prepare import Brightness, PreparedFrame
 from hybrid.alignment.residual import Limited, warp_residual
 from hybrid.files.frame import Array
-from hybrid.files.passes import NO_PASSES, Passes
-from loops.parallel import Doubles, Mask
+from loops.parallel import Mask
 from nlm.pooling import PooledSamples, SampleRange, find_range, pool_samples
 from nlm.samples import SampleMean
 from nlm.variance import prefilter_noisy_rows, smooth_variance, variance_from_window
@@ -60,8 +59,8 @@ class Window:
         return min(there, key=lambda frame: (not frame.valid.any(), abs(frame.number - centre)))
 
 
-class Trust(NamedTuple):
-    """How far geometry trusts a warped neighbour, before anything is known of its light."""
+class Geometry(NamedTuple):
+    """The comparison of a warped neighbour with the centre by motion, albedo and normals, without its light."""
 
     coverage: Mask  # (h, W): where the neighbour shows a measured color
     confidence: Array  # (h, W), in [0, 1]
@@ -83,16 +82,13 @@ class WarpSources:
 
     def warp(self, name: str, centre_layer: Array, part: slice = slice(None)) -> Array:
         """Warp a layer of all frames, (T, h, W, 3), to rows of the centre, or all; its own where there is no flow."""
-        here = centre_layer[part]
         first = self.rows.start + part.indices(len(centre_layer))[0]
-        window = np.empty((len(self.frames), *here.shape), np.float32)
+        window = np.empty((len(self.frames), *centre_layer[part].shape), np.float32)
         for frame, flow, out in zip(self.frames, self.flows, window, strict=True):
             if frame is None or flow is None:
-                out[...] = here
-            elif (vectors := flow[part]).any():
-                warp(getattr(frame, name), vectors, first_row=first, out=out)
+                out[...] = centre_layer[part]
             else:
-                out[...] = getattr(frame, name)[first : first + len(here)]
+                warp_rows(getattr(frame, name), flow[part], first, out)
             self.release()
         return window
 
@@ -130,85 +126,89 @@ class WarpSources:
 
 
 @dataclass(frozen=True)
+class Centre:
+    """The centre of an aligned window, at its rows."""
+
+    frame: PreparedFrame  # the whole frame
+    # (h, W, 3): without rejected outliers; the mean of the neighbours where the renderer's color was not finite
+    irradiance: Array
+    guides: dict[str, Array]  # (h, W, 3): albedo and normal, as far as there are any
+    # (h, W, 3): the albedo, prefiltered where the plan has it; None also where nobody reads the `guide`
+    clean_albedo: Array | None
+    filtered_guides: dict[str, Array] | None = None  # (h, W, 3): `guides` without noise, as `Window.filtered_guides`
+    first_pass: Array | None = None  # (H, W, 3): radiance of the whole frame
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """Measurements of the neighbours by which the denoised centre is averaged with others, and corrected."""
+
+    geometry: tuple[Geometry | None, Geometry | None]  # of the frames before and after the centre
+    samples: SampleMean | None = None  # their mean at the centre's pixels, radiance; with the stage "blend-samples"
+    drift_weight: Array | None = None  # (h, W): weight of the frame after the centre by its drift; with stage "drift"
+
+
+@dataclass(frozen=True)
 class AlignedWindow:
     """A window of 2k + 1 frames, every one warped to the centre; or some rows of it, for the same pixels.
 
-    Figures of the whole frame (`exposure`, `moments`) are measured before: everything done with a window is local.
+    Figures of the whole frame (`brightness`) are measured before: everything done with a window is local.
     """
 
-    number: int  # the centre frame's number
-    centre_irradiance: Array  # (H, W, 3): the centre's irradiance
-    aligned_color: Array | None  # (T, H, W, 3): `color`, where it was needed for the alignment
-    guides: dict[str, Array]  # (H, W, 3): the centre's albedo and normal, as far as there are any
+    centre: Centre
+    neighbours: Neighbours
     sources: WarpSources  # the frames and flows, for layers that are warped when they are read
-    confidence: Array  # (T, H, W), in [0, 1]; the centre's is 1 wherever its own color was finite
-    modulation: Array  # (H, W, 3): radiance of an irradiance of 1: the centre's prefiltered albedo plus the floor, or 1
-    # (H, W, 3): the centre's albedo, prefiltered where the plan has it; None also where nobody reads the `guide`
-    clean_albedo: Array | None
-    # (T, H, W): confidence by geometry alone, with which guides are prefiltered; None where nobody reads the `guide`
-    geometric_confidence: Array | None
-    rendered_variance: Array | None  # (H, W, 3), of the centre's irradiance, where the file has one
-    # (T, H, W, 3): the first pass, aligned, as irradiance; the centre's where a frame shows nothing, pulled to it where
-    # the light drifts
-    first_pass: Array | None
-    centre_first_pass: Array | None  # (H, W, 3): the centre's first pass, radiance of the whole frame
-    aovs: dict[str, Array]  # (T, H, W, C): further layers, warped, and divided by the albedo where they are textured
-    repaired: int  # pixels of the centre frame that were not finite
-    fireflies: int  # single bright samples removed from the centre frame
-    outliers: int  # samples of the window, within `inner`, rejected as fireflies
-    exposure: float  # brightness of the centre's irradiance
-    # (2, G + 1): mean and deviation over the whole frame of `guide`'s channels, and of the tone-mapped light
-    moments: Doubles
-    inner: slice  # the requested rows; those around them are there because the result depends on them
     stages: frozenset[str]  # the stages that run
-    # the share of the picture, in [0, 1], on which a stage ran that runs only in places
-    shares: Mapping[str, float] = field(default_factory=dict)
-    # (H, W, 3): the centre's colors of those `aovs` that are light without it
-    pass_colors: dict[str, Array] = field(default_factory=dict)
-    # the mean of the neighbours' samples at the centre's pixels, radiance; with the stage "blend-samples"
-    neighbour_samples: SampleMean | None = None
-    # of the frame before and the frame after the centre; None where there is none
-    neighbour_trust: tuple[Trust | None, Trust | None] = (None, None)
-    # (H, W): the weight of the frame after the centre by its drift; with the stage "drift"
-    drift_weight: Array | None = None
+    inner: slice  # the requested rows; those around them are there because the result depends on them
+    confidence: Array  # (T, h, W), in [0, 1]; the centre's is 1 wherever its own color was finite
+    # (T, h, W): confidence by geometry alone, with which guides are prefiltered; None where nobody reads the `guide`
+    geometric_confidence: Array | None
+    modulation: Array  # (h, W, 3): radiance of an irradiance of 1: the centre's prefiltered albedo plus the floor, or 1
+    brightness: Brightness  # of the centre, or of the nearest frame with light
+    aovs: dict[str, Array]  # (T, h, W, C): further layers, warped, and divided by the albedo where they are textured
+    aligned_color: Array | None = None  # (T, h, W, 3): `color`, where it was needed for the alignment
+    # (T, h, W, 3): the first pass, aligned, as irradiance; the centre's where a frame shows nothing, pulled to it where
+    # the light drifts
+    first_pass: Array | None = None
     known_range: SampleRange | None = None  # `sample_range`, where it was found along the way
-    passes: Passes = NO_PASSES  # the relation of `aovs` to the color
-    filtered_guides: dict[str, Array] | None = None  # (H, W, 3): `guides` without noise, as `Window.filtered_guides`
+    outliers: int = 0  # samples of the window, within `inner`, rejected as fireflies
 
     @cached_property
     def color(self) -> Array:
         """Irradiance (T, H, W, 3) without rejected outliers; a missing frame is the centre's, with confidence 0."""
         if self.aligned_color is not None:
             return self.aligned_color
-        color = self.sources.warp("irradiance", self.centre_irradiance)
-        color[self.centre] = self.centre_irradiance
+        color = self.sources.warp("irradiance", self.centre.irradiance)
+        color[self.middle] = self.centre.irradiance
         return color
 
     @property
     def albedo(self) -> Array | None:
         """Albedo of all frames, aligned, (T, H, W, 3), or None. Warped at each access."""
-        return self.sources.warp("albedo", self.guides["albedo"]) if "albedo" in self.guides else None
+        return self.sources.warp("albedo", self.centre.guides["albedo"]) if "albedo" in self.centre.guides else None
 
     @property
     def normal(self) -> Array | None:
         """As `albedo`."""
-        return self.sources.warp("normal", self.guides["normal"]) if "normal" in self.guides else None
+        return self.sources.warp("normal", self.centre.guides["normal"]) if "normal" in self.centre.guides else None
 
     @cached_property
     def guide(self) -> Array | None:
         """The centre's albedo and normal, prefiltered, (H, W, G). Made at the first access."""
-        clean = [] if self.clean_albedo is None else [self.clean_albedo]
-        if "normal" in self.guides:
+        clean = [] if self.centre.clean_albedo is None else [self.centre.clean_albedo]
+        if "normal" in self.centre.guides:
             assert self.geometric_confidence is not None
-            clean.append(clean_guide("normal", self.guides, self.sources, self.geometric_confidence, self.stages))
+            normal = clean_guide("normal", self.centre.guides, self.sources, self.geometric_confidence, self.stages)
+            clean.append(normal)
         return np.concatenate(clean, axis=-1) if clean else None
 
     @cached_property
     def variance(self) -> Array:
         """The smoothed variance of the centre's `color`, (H, W, 3). Made at the first access."""
-        if self.rendered_variance is None:
+        variance = self.centre.frame.variance
+        if variance is None:
             return variance_from_window(self.color, self.confidence)
-        return smooth_variance(self.rendered_variance)
+        return smooth_variance(variance[self.sources.rows])
 
     @property
     def residual(self) -> Array | None:
@@ -226,10 +226,10 @@ class AlignedWindow:
         if self.first_pass is None:
             raise ValueError("aligned: expected a window with estimates, got none")
         weight = self.confidence if weight is None else weight
-        pooled = PooledSamples(*(np.empty_like(self.centre_irradiance) for _ in PooledSamples._fields))
+        pooled = PooledSamples(*(np.empty_like(self.centre.irradiance) for _ in PooledSamples._fields))
         for top, residual in self.sources.residual_strips(limited=True):
             rows = slice(top, top + residual.shape[1])
-            strip = pool_samples(self.first_pass[:, rows], residual, weight[:, rows], self.exposure)
+            strip = pool_samples(self.first_pass[:, rows], residual, weight[:, rows], self.brightness.exposure)
             for whole, part in zip(pooled, strip, strict=True):
                 whole[rows] = part
         return pooled
@@ -241,23 +241,36 @@ class AlignedWindow:
         return self.known_range or find_range(self.first_pass, self.sources.residual_strips())
 
     @property
-    def centre(self) -> int:
+    def middle(self) -> int:
         """Index of the centre frame."""
         return len(self.confidence) // 2
+
+    @property
+    def number(self) -> int:
+        """Number of the centre frame."""
+        return self.centre.frame.number
 
     def mixed(self, layer: Array) -> Array:
         """Mix the centre into the side frames of `layer` (T, H, W, C), in inverse proportion to confidence."""
         mixed = np.empty(layer.shape, np.float32)
         for warped, confidence, out in zip(layer, self.confidence, mixed, strict=True):
-            mix_centre(warped, layer[self.centre], confidence, out)
+            mix_centre(warped, layer[self.middle], confidence, out)
         return mixed
 
 
+def warp_rows(layer: Array, flow: Array, first_row: int, out: Array, *, interpolation: str = "bilinear") -> None:
+    """Warp a layer (H, W, C) to the centre's rows from `first_row`, by their flow (h, W, 2), into `out` (h, W, C)."""
+    if flow.any():
+        warp(layer, flow, interpolation=interpolation, first_row=first_row, out=out)
+    else:
+        out[...] = layer[first_row : first_row + len(out)]
+
+
 def clean_guide(
-    name: str, guides: dict[str, Array], sources: WarpSources, trust: Array, stages: Collection[str]
+    name: str, guides: dict[str, Array], sources: WarpSources, confidence: Array, stages: Collection[str]
 ) -> Array:
     """Average the centre's "albedo" or "normal" over the window with the stage "prefilter"; else return it."""
     guide = guides[name]
     if "prefilter" not in stages:
         return guide
-    return prefilter_noisy_rows(guide, partial(sources.warp, name, guide), trust)
+    return prefilter_noisy_rows(guide, partial(sources.warp, name, guide), confidence)

@@ -171,7 +171,7 @@ def window_maps(aligned: AlignedWindow, denoise: WindowFilter) -> dict[str, Arra
     neighbours: the relative change of the result for a relative change of the neighbours' light. For a
     weighted mean that is the fraction of their weight in the light, and it is defined for any denoiser.
     """
-    is_neighbour = np.arange(len(aligned.confidence)) != aligned.centre
+    is_neighbour = np.arange(len(aligned.confidence)) != aligned.middle
     # Small enough to change no decision, and far above the rounding of float32.
     step = np.float32(1 / 256)
     gain = 1 + np.where(is_neighbour, step, 0).astype(np.float32)[:, None, None, None]

@@ -34,12 +34,12 @@ def filter_aovs(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:
     if not names:
         return means
     for name in names:
-        if aligned.aovs[name][aligned.centre].min() >= 0:
+        if aligned.aovs[name][aligned.middle].min() >= 0:
             np.maximum(means[name], 0, out=means[name])  # interpolation undershoots
-    light = compress(irradiance.mean(axis=-1, keepdims=True), aligned.exposure)
+    light = compress(irradiance.mean(axis=-1, keepdims=True), aligned.brightness.exposure)
     guide = np.concatenate([*([] if aligned.guide is None else [aligned.guide]), light], axis=-1)
-    moments = aligned.moments[:, : guide.shape[-1]]
-    if any(not found.complete for found in aligned.passes.sums):
+    moments = aligned.brightness.moments[:, : guide.shape[-1]]
+    if any(not found.complete for found in aligned.centre.frame.passes.sums):
         means[BEAUTY] = average(aligned.color, aligned.confidence)
         names.append(BEAUTY)
     return means | dict(zip(names, filter_layers([means[n] for n in names], guide, moments=moments), strict=True))
@@ -51,7 +51,8 @@ def share_out(aligned: AlignedWindow, filtered: dict[str, Array], irradiance: Ar
     The AOVs, (H, W, C), are without texture where they are textured. With `add` the color becomes the sum of its parts;
     otherwise the parts are scaled to it.
     """
-    sums, exposure = aligned.passes.sums, aligned.exposure
+    sums, exposure = aligned.centre.frame.passes.sums, aligned.brightness.exposure
+    pass_colors = aligned.centre.frame.pass_colors
     aovs = {name: layer for name, layer in filtered.items() if name != BEAUTY}
     filtered_color = filtered.get(BEAUTY, irradiance) * aligned.modulation
     factors = {name: _factor(name, aligned) for name in aovs}
@@ -67,8 +68,7 @@ def share_out(aligned: AlignedWindow, filtered: dict[str, Array], irradiance: Ar
             split = parts
         elif found.complete:
             bounds = [
-                average(aligned.aovs[name], aligned.confidence) if name in aligned.pass_colors else None
-                for name in found.parts
+                average(aligned.aovs[name], aligned.confidence) if name in pass_colors else None for name in found.parts
             ]
             split = split_light(parts, images[whole], exposure=exposure, factors=by, bounds=bounds)
         else:
@@ -80,19 +80,20 @@ def share_out(aligned: AlignedWindow, filtered: dict[str, Array], irradiance: Ar
             images[name] = add_light([part], [factor])
     for name in aovs:
         if name == ALPHA:
-            centre_alpha = aligned.aovs[name][aligned.centre]
+            centre_alpha = aligned.aovs[name][aligned.middle]
             clean = denoise_alpha(aovs[name]) if "clean-alpha" in aligned.stages else aovs[name]
             aovs[name] = np.where(_is_uniform(centre_alpha), centre_alpha, clean)
-        elif name not in aligned.pass_colors and (factor := factors[name]) is not None:
+        elif name not in pass_colors and (factor := factors[name]) is not None:
             aovs[name] = aovs[name] * factor
     return SharedLight(aovs, images[BEAUTY], frozenset(name for found in sums for name in found.parts))
 
 
 def _factor(name: str, aligned: AlignedWindow) -> Array | None:
     """Factor from a filtered AOV to radiance; None: 1."""
-    if name in aligned.pass_colors:
-        return aligned.pass_colors[name]
-    if name not in aligned.passes.textured:
+    frame = aligned.centre.frame
+    if name in frame.pass_colors:
+        return frame.pass_colors[name][aligned.sources.rows]
+    if name not in frame.passes.textured:
         return None
     modulation = aligned.modulation
     return modulation if aligned.aovs[name].shape[-1] == 3 else modulation.mean(axis=-1, keepdims=True)

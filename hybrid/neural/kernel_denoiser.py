@@ -34,7 +34,7 @@ class KernelDenoiser(NetworkDenoiser):
             mixed = [aligned.mixed(layer) for layer in aligned.aovs.values()]
             empty = np.empty((*aligned.confidence.shape, 0), np.float32)
             aovs = np.concatenate([empty, *mixed], axis=-1)
-            result = self._run(aligned, layers | ({"aovs": aovs} if mixed else {}), aovs[aligned.centre])
+            result = self._run(aligned, layers | ({"aovs": aovs} if mixed else {}), aovs[aligned.middle])
             edges = np.cumsum([layer.shape[-1] for layer in mixed])[:-1]
             filtered = dict(zip(aligned.aovs, np.split(result.aovs, edges, axis=-1), strict=True)) if mixed else {}
             shared = share_out(aligned, filtered, result.irradiance, add=self.setup.add_layers)

@@ -99,12 +99,12 @@ class NetworkDenoiser(WindowDenoiser):
             with torch.inference_mode():
                 tile = None if skipped else self._run_tile(aligned, window, outer)
             if not irradiance.size:  # not before: while a network runs, memory is at its fullest
-                irradiance = np.zeros_like(aligned.centre_irradiance)  # rows without tiles are not read
+                irradiance = np.zeros_like(aligned.centre.irradiance)  # rows without tiles are not read
             if tile is None:
-                irradiance[inner], filtered[inner] = aligned.centre_irradiance[inner], aovs[inner]
+                irradiance[inner], filtered[inner] = aligned.centre.irradiance[inner], aovs[inner]
                 if parts is not None:
                     weight = np.ones_like(irradiance[inner][..., :1])
-                    parts[aligned.centre][inner] = np.dstack([irradiance[inner], weight])
+                    parts[aligned.middle][inner] = np.dstack([irradiance[inner], weight])
                 continue
             with torch.inference_mode():
                 irradiance[inner] = image_of(tile.irradiance)[offset]
@@ -126,4 +126,4 @@ class NetworkDenoiser(WindowDenoiser):
 
 def exposure_of(aligned: AlignedWindow) -> torch.Tensor:
     """Brightness of a window, (1,), as networks get it in training and in running."""
-    return torch.tensor([aligned.exposure], dtype=torch.float32)
+    return torch.tensor([aligned.brightness.exposure], dtype=torch.float32)

@@ -50,16 +50,16 @@ class UNetDenoiser(NetworkDenoiser):
         return prefilter_guides if self.model.config.clean_guides and has_oidn_networks() else None
 
     def __call__(self, aligned: AlignedWindow) -> Denoised:
-        if aligned.first_pass is None or aligned.centre_first_pass is None:
+        if aligned.first_pass is None or aligned.centre.first_pass is None:
             raise ValueError("estimate: expected those of the frames, as this network takes, got none")
         with self.setup.timings.stage("pool"):
             weights = self._weigh(aligned)
-            guides = clean_guides(aligned) if self.model.config.clean_guides else aligned.guides
+            guides = clean_guides(aligned) if self.model.config.clean_guides else aligned.centre.guides
             inputs = _Inputs(self._pool(aligned, weights), guides, weights)
         with self.setup.timings.stage("network"):
             # `measure_exposure` returns 1 for an image without light, as far as numbers go.
-            black = aligned.centre_first_pass.max() < 1 and measure_exposure(aligned.centre_first_pass) == 1
-            nothing = np.empty((*aligned.centre_irradiance.shape[:2], 0), np.float32)
+            black = aligned.centre.first_pass.max() < 1 and measure_exposure(aligned.centre.first_pass) == 1
+            nothing = np.empty((*aligned.centre.irradiance.shape[:2], 0), np.float32)
             result = self._run(aligned, inputs, nothing, bool(black))
             if self.clamps:
                 result = result._replace(irradiance=clamp_to_range(result.irradiance, aligned.sample_range))
@@ -128,9 +128,9 @@ class UNetDenoiser(NetworkDenoiser):
 
 def clean_guides(aligned: AlignedWindow) -> dict[str, Array]:
     """The centre's albedo and normal, denoised where the plan has found noise: in training and in running."""
-    guides = aligned.guides
-    if aligned.filtered_guides is not None:
-        return aligned.filtered_guides
+    guides = aligned.centre.guides
+    if aligned.centre.filtered_guides is not None:
+        return aligned.centre.filtered_guides
     if "prefilter" not in aligned.stages or not guides or has_oidn_networks() or aligned.guide is None:
         return guides
     # The filtered guide of the window is less accurate where guides are very noisy.
@@ -139,6 +139,6 @@ def clean_guides(aligned: AlignedWindow) -> dict[str, Array]:
 
 def gain_of(aligned: AlignedWindow) -> torch.Tensor:
     """Factor of radiance before the transfer curve, (1,): in training and in running."""
-    if aligned.centre_first_pass is None:
+    if aligned.centre.first_pass is None:
         raise ValueError("aligned: expected a window with estimates, got none")
-    return torch.tensor([measure_gain(aligned.centre_first_pass)], dtype=torch.float32)
+    return torch.tensor([measure_gain(aligned.centre.first_pass)], dtype=torch.float32)

@@ -98,7 +98,7 @@ def test_pixels_of_any_layer_are_counted_once_each():
     frames = [spoil(f, aovs={"mask": np.ones_like(mask)}) for f in frames]
     frames[MIDDLE] = spoil(one, color=color, albedo=albedo, normal=normal, aovs={"mask": mask})
     window = align(frames)
-    assert window.repaired == 4
+    assert window.centre.frame.repaired == 4
     assert np.isfinite(window.aovs["mask"]).all()
 
 
@@ -158,7 +158,7 @@ def test_a_lost_block_is_made_of_its_neighbours():
 def test_a_lost_shot_is_black_and_not_nan():
     frames = [spoil(f, color=np.full_like(f.color, np.nan)) for f in shot()]
     window, image = denoise(frames)
-    assert window.repaired == SCENE.height * SCENE.width
+    assert window.centre.frame.repaired == SCENE.height * SCENE.width
     assert (image == 0).all()
 
 

@@ -214,7 +214,7 @@ def test_nothing_that_is_not_finite_is_written_of_any_view(tmp_path, where):
             layers[name.replace("ViewLayer", "Zenith")] = layers[name] * np.float32(9 if "Combined" in name else 1)
 
     def denoise(aligned):
-        color = aligned.color[aligned.centre] * aligned.modulation
+        color = aligned.color[aligned.middle] * aligned.modulation
         if where == "another layer":
             return Denoised(color, {"shadow": np.full(color.shape, np.nan, np.float32)})
         return Denoised(color * np.float32(np.nan) if color.mean() > 3 else color)
@@ -327,7 +327,7 @@ def test_the_outliers_of_all_bands_are_counted(shot_folder, monkeypatch):
     stream = FrameStream(open_shot(shot_folder), Rules(off=frozenset({"stabilize"})))
 
     def denoise(aligned):
-        return Denoised(aligned.color[aligned.centre] * aligned.modulation)
+        return Denoised(aligned.color[aligned.middle] * aligned.modulation)
 
     denoiser = FrameDenoiser(stream, denoise, rows=20)
     assert denoiser.make(1002).outliers == 3 * Scene.height // 20

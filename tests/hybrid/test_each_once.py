@@ -32,7 +32,7 @@ EXPECTED = {
     "compose_flow": 2 * SECOND,
     "align": FRAMES,
     "clean_guide": FRAMES,
-    "trust_geometry": NEXT + SECOND,
+    "confidence_by_geometry": NEXT + SECOND,
     "measure_exposure": FRAMES,
     "denoise": FRAMES,
     "align_results": FRAMES,
@@ -70,7 +70,7 @@ def count(monkeypatch):
         watch(stream, name)
     for name in ("align", "align_results", "find_bright", "restore_mean", "blend_samples"):
         watch(stabilize, name)
-    watch(align, "trust_geometry")
+    watch(align, "confidence_by_geometry")
     watch(align, "clean_guide")
     watch(prepare, "measure_exposure")
     watch(flows, "compose_flow")

@@ -56,7 +56,7 @@ def test_no_more_is_held_than_memory_is_planned_for(tmp_path, filters_guides):
 
     def denoise(aligned):
         held.append(planes((maker.stream._cache, maker._results)))
-        return Denoised(aligned.centre_irradiance * aligned.modulation)
+        return Denoised(aligned.centre.irradiance * aligned.modulation)
 
     rules = Rules(on=frozenset({"clean-guides"}))
     filter_guides = {"filter_guides": dict} if filters_guides else {}
@@ -80,12 +80,12 @@ def test_what_cleans_guides_is_kept_for_those_who_read_them(tmp_path, guided):
     window = FrameStream(shot_of(tmp_path), Rules(), FIRST_PASS).window(MIDDLE)
     aligned = align(window, guided=guided)
     assert (aligned.geometric_confidence is not None) == guided
-    assert (aligned.clean_albedo is not None) == guided
+    assert (aligned.centre.clean_albedo is not None) == guided
 
 
 def test_of_an_excess_only_bright_pixels_are_kept(tmp_path):
     maker = FrameDenoiser(
-        FrameStream(shot_of(tmp_path), Rules(), FIRST_PASS), lambda aligned: Denoised(aligned.centre_first_pass)
+        FrameStream(shot_of(tmp_path), Rules(), FIRST_PASS), lambda aligned: Denoised(aligned.centre.first_pass)
     )
     maker.make(MIDDLE)
     result = maker._results[MIDDLE]

@@ -25,7 +25,7 @@ def shot(tmp_path):
 
 
 def picture(aligned):
-    return Denoised(aligned.color[aligned.centre] * aligned.modulation)
+    return Denoised(aligned.color[aligned.middle] * aligned.modulation)
 
 
 def outcomes(frames):

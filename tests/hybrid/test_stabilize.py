@@ -62,7 +62,7 @@ def aligned_results(maker, number, colors):
     result = maker._results[number]
     window = maker.stream.window_of_results(number, colors)
     stillness = measure_stillness(result.drift_weight, maker.stream.shot.shape)
-    return align_results(window, result.trust, stillness, result.exposure)
+    return align_results(window, result.geometry, stillness, result.exposure)
 
 
 def made(shot, denoise, number=MIDDLE, rules=None, **options):
@@ -255,7 +255,7 @@ def test_a_part_of_a_frame_is_what_the_whole_is_there(tmp_path):
             starts = range(0, scene.height, 64)
             top = next(
                 max(s - 192, 0) for s in starts
-                if np.array_equal(albedo[max(s - 192, 0) :][: aligned.color.shape[1]], aligned.albedo[aligned.centre])
+                if np.array_equal(albedo[max(s - 192, 0) :][: aligned.color.shape[1]], aligned.albedo[aligned.middle])
             )  # fmt: skip
             rows = slice(top, top + aligned.color.shape[1])
         errors = np.random.default_rng(aligned.number).normal(0, ERROR, (scene.height, scene.width, 3))
@@ -479,7 +479,7 @@ class TestSamples:
 
     @staticmethod
     def blurred(aligned):
-        return Denoised(cv2.blur(aligned.centre_irradiance * aligned.modulation, (5, 5)))
+        return Denoised(cv2.blur(aligned.centre.irradiance * aligned.modulation, (5, 5)))
 
     def test_a_shot_without_noise_stays_as_it_is(self, tmp_path):
         scene = MOVING  # equal frames may be one seed's: these tell nothing
@@ -543,7 +543,7 @@ class TestSamples:
         blind = PerFrame(lambda frame: cv2.medianBlur(np.ascontiguousarray(frame.color), 5))
 
         def median(aligned):
-            return Denoised(cv2.medianBlur(np.ascontiguousarray(aligned.centre_irradiance * aligned.modulation), 5))
+            return Denoised(cv2.medianBlur(np.ascontiguousarray(aligned.centre.irradiance * aligned.modulation), 5))
 
         result = made(shot, median, number, rules, first_pass=blind)
         rows, columns = (flakes + np.array([14, 0])).T
@@ -575,7 +575,7 @@ class TestSamples:
         right = clean["ViewLayer.Combined"]
 
         def soft(aligned):
-            picture = cv2.GaussianBlur(aligned.centre_irradiance * aligned.modulation, (0, 0), 0.4)
+            picture = cv2.GaussianBlur(aligned.centre.irradiance * aligned.modulation, (0, 0), 0.4)
             return Denoised(np.ascontiguousarray(picture))
 
         result = made(shot, soft, number, rules, first_pass=PerFrame(lambda frame: frame.color))

@@ -136,7 +136,7 @@ def test_a_lamp_of_one_pixel_that_is_there_in_every_frame_stays(tmp_path):
 
     shot = open_shot(CALM.write(tmp_path, edit=lamp))
     aligner = FrameStream(shot, Rules())
-    assert aligner.align(1006).fireflies == 0
+    assert aligner.align(1006).centre.frame.fireflies == 0
     frame = aligner.frame(1006)
     assert frame.with_highlights[20, 30].mean() == pytest.approx(500, rel=2e-3)
     assert frame.with_highlights.sum() == pytest.approx(shot.read(1006).color.sum(), rel=2e-3)

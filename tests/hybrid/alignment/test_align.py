@@ -64,8 +64,18 @@ def test_a_part_of_a_frame_is_that_part_of_the_whole(tmp_path):
     for name in ("color", "albedo", "normal", "confidence"):
         np.testing.assert_array_equal(getattr(part, name)[:, part.inner], getattr(whole, name)[:, 64:128])
     np.testing.assert_array_equal(part.modulation[part.inner], whole.modulation[64:128])
-    assert part.exposure == whole.exposure
-    np.testing.assert_array_equal(part.moments, whole.moments)
+    assert part.brightness.exposure == whole.brightness.exposure
+    np.testing.assert_array_equal(part.brightness.moments, whole.brightness.moments)
+
+
+def test_a_part_of_a_frame_has_the_variance_of_its_rows(tmp_path):
+    """Each band of rows had the variance of the whole frame, whose first rows are those of another band."""
+    folder = Scene(height=448, width=40, frames=1).write(tmp_path)
+    window = FrameStream(open_shot(folder), only(STAGES), radius=0).window(SCENE.first)
+    variance = np.random.default_rng(0).random((448, 40, 3), np.float32)
+    window = replace(window, frames=(replace(window.centre, variance=variance),))
+    whole, part = align(window), align(window, slice(300, 400))
+    np.testing.assert_array_equal(part.variance[part.inner], whole.variance[300:400])
 
 
 def test_frames_that_are_missing_have_no_confidence(tmp_path):

@@ -69,8 +69,8 @@ def test_the_window_says_on_what_share_of_the_picture_vectors_were_solved_for(fa
         return solved
 
     aligner = FrameStream(open_shot(fast_folder), only(STAGES | {"refine"}), radius=1, refine=solve)
-    assert aligner.align(FAST.first + 1).shares == {"refine": pytest.approx(part)}
-    assert FrameStream(open_shot(fast_folder), only(STAGES), radius=1).align(FAST.first + 1).shares == {}
+    assert aligner.window(FAST.first + 1).refined == pytest.approx((part,) * 4)
+    assert FrameStream(open_shot(fast_folder), only(STAGES), radius=1).window(FAST.first + 1).refined == ()
 
 
 def test_without_refinement_nothing_is_refined(fast_folder):

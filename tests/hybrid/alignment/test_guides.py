@@ -71,18 +71,20 @@ def test_a_stream_filters_each_frame_once_for_those_who_ask(tmp_path) -> None:
     stream = FrameStream(shot, only(stages), first_pass, radius=1, filter_guides=halve)
     for number in range(scene.first + 1, scene.first + 4):
         aligned = stream.align(number)
-        assert set(aligned.filtered_guides) == {"albedo", "normal"}
-        np.testing.assert_allclose(aligned.filtered_guides["albedo"], aligned.guides["albedo"] / 2, rtol=1e-3)
+        assert set(aligned.centre.filtered_guides) == {"albedo", "normal"}
+        np.testing.assert_allclose(
+            aligned.centre.filtered_guides["albedo"], aligned.centre.guides["albedo"] / 2, rtol=1e-3
+        )
     assert len(filtered) == 5
     band = align(stream.window(scene.first + 2), slice(0, 8))
     whole = align(stream.window(scene.first + 2))
-    for name, guide in band.filtered_guides.items():
-        np.testing.assert_array_equal(guide[band.inner], whole.filtered_guides[name][:8])
+    for name, guide in band.centre.filtered_guides.items():
+        np.testing.assert_array_equal(guide[band.inner], whole.centre.filtered_guides[name][:8])
     for others in (
         FrameStream(shot, only(stages - {"clean-guides"}), first_pass, filter_guides=halve),
         FrameStream(shot, only(stages), first_pass),  # its plan has no such stage, which it could not run
         FrameStream(shot, only(stages), filter_guides=halve),
     ):
-        assert others.align(scene.first + 2).filtered_guides is None
+        assert others.align(scene.first + 2).centre.filtered_guides is None
     assert "clean-guides" in stream.align(scene.first + 2).stages
     assert "clean-guides" not in FrameStream(shot, only(stages), first_pass).align(scene.first + 2).stages

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from hybrid.alignment.window import warp_rows
 from hybrid.files.shots import open_shot
 from hybrid.first_pass import PerFrame
 from hybrid.stream import FrameStream
@@ -19,6 +21,14 @@ MIDDLE = SCENE.first + 2
 
 def window(folder):
     return FrameStream(open_shot(folder), only(STAGES)).align(MIDDLE)
+
+
+@pytest.mark.parametrize("step", [0, 2])
+def test_a_layer_is_moved_to_rows_of_the_centre(step):
+    layer = np.random.default_rng(0).random((40, 30, 3), np.float32)
+    warped = np.empty((25, 30, 3), np.float32)
+    warp_rows(layer, np.full((25, 30, 2), (step, 0), np.float32), 5, warped)
+    np.testing.assert_array_equal(warped[:, : 30 - step], layer[5:30, step:])  # whole pixels
 
 
 def test_the_centre_takes_the_place_of_what_is_not_trusted(tmp_path):
@@ -53,7 +63,7 @@ def test_colors_beside_estimates_are_those_without(tmp_path):
     assert "outliers" not in beside.stages
     assert (beside.confidence[2, 10:14, 20:24] == 0).all()
     np.testing.assert_array_equal(beside.color, without.color)
-    np.testing.assert_array_equal(beside.centre_irradiance, without.color[2])
+    np.testing.assert_array_equal(beside.centre.irradiance, without.color[2])
 
 
 def test_the_guides_of_all_frames_are_aligned_as_these_are(tmp_path):
@@ -62,7 +72,7 @@ def test_the_guides_of_all_frames_are_aligned_as_these_are(tmp_path):
     (folder / f"shot.{MIDDLE + 1}.exr").unlink()
     aligned, alone = window(folder), open_shot(folder).read(MIDDLE)
     for name in ("albedo", "normal"):
-        layer, own = getattr(aligned, name), aligned.guides[name]
+        layer, own = getattr(aligned, name), aligned.centre.guides[name]
         np.testing.assert_array_equal(own, getattr(alone, name))
         np.testing.assert_array_equal(layer[2], own)
         np.testing.assert_array_equal(layer[3], own)  # a frame that is missing

@@ -70,7 +70,7 @@ class TestMaps:
     def aligned(self, shot: Shot, confidence: float) -> methods.AlignedWindow:
         window = FrameStream(shot, only({"demodulate", "warp"}), radius=1).align(SCENE.first + 1)
         trust = np.full_like(window.confidence, confidence)
-        trust[window.centre] = 1
+        trust[window.middle] = 1
         return replace(window, confidence=trust)
 
     @pytest.mark.parametrize("confidence", [0.0, 0.5, 1.0])
@@ -78,7 +78,7 @@ class TestMaps:
         aligned = self.aligned(shot, confidence)
         maps = window_maps(aligned, aligned_average)
         light = aligned.color * aligned.confidence[..., None] * aligned.modulation
-        expected = 1 - light[aligned.centre].mean(axis=-1) / light.sum(axis=0).mean(axis=-1)
+        expected = 1 - light[aligned.middle].mean(axis=-1) / light.sum(axis=0).mean(axis=-1)
         # Float32 rounding of the difference of two pictures, over a step of 1/256.
         np.testing.assert_allclose(maps["Temporal contribution"], expected, atol=2e-4)
         np.testing.assert_allclose(maps["Confidence"], confidence)
@@ -119,8 +119,8 @@ def test_a_network_gets_its_guides_filtered_as_in_a_run(shot: Shot, monkeypatch:
         filter_guides = staticmethod(dict)
 
         def __call__(self, aligned: AlignedWindow) -> Denoised:
-            guided.append(aligned.filtered_guides is not None)
-            return Denoised(aligned.centre_irradiance * aligned.modulation)
+            guided.append(aligned.centre.filtered_guides is not None)
+            return Denoised(aligned.centre.irradiance * aligned.modulation)
 
     monkeypatch.setattr(methods, "_denoiser", lambda *settings: Denoiser())
     network = Network("quality", WindowSettings(source="nlm", rules=only({"demodulate", "warp", "clean-guides"})))

@@ -66,7 +66,9 @@ def test_a_clip_holds_what_the_network_is_given_when_it_runs(dim, tmp_path, monk
     window = FrameStream(shot, Rules(), first_pass=Classical(FINAL)).align(MIDDLE)
     with pytest.raises(StopIteration):
         open_network(tmp_path / "w.safetensors", precision="float32")(window)
-    given |= {name: torch.from_numpy(window.guides[name]).permute(2, 0, 1)[None] for name in ("albedo", "normal")}
+    given |= {
+        name: torch.from_numpy(window.centre.guides[name]).permute(2, 0, 1)[None] for name in ("albedo", "normal")
+    }
     for name, value in given.items():
         wanted = getattr(clip, "estimate" if name == "first_pass" else name)
         if name in ("albedo", "normal"):

@@ -43,13 +43,13 @@ def test_a_black_frame_stays_black(tmp_path, monkeypatch):
 def test_guides_are_cleaned_where_they_have_noise(tmp_path, monkeypatch):
     folder = SCENE.write(tmp_path)
     plain = align(folder)
-    assert clean_guides(plain) is plain.guides
+    assert clean_guides(plain) is plain.centre.guides
     noisy = align(folder, "prefilter")
     monkeypatch.setattr(unet_denoiser, "has_oidn_networks", lambda: False)
     ours = clean_guides(noisy)
     np.testing.assert_array_equal(np.concatenate(list(ours.values()), axis=-1), noisy.guide)
-    filtered = {name: -guide for name, guide in noisy.guides.items()}
-    assert clean_guides(replace(noisy, filtered_guides=filtered)) is filtered
+    filtered = {name: -guide for name, guide in noisy.centre.guides.items()}
+    assert clean_guides(replace(noisy, centre=replace(noisy.centre, filtered_guides=filtered))) is filtered
 
 
 def test_only_a_network_that_relies_on_clean_guides_has_them_filtered(monkeypatch):
@@ -69,8 +69,8 @@ def test_a_shot_of_few_samples_is_denoised_with_filtered_guides(tmp_path):
             return guides
 
         def __call__(self, aligned):
-            assert (aligned.filtered_guides is not None) == ("clean-guides" in aligned.stages)
-            return Denoised(aligned.centre_irradiance * aligned.modulation)
+            assert (aligned.centre.filtered_guides is not None) == ("clean-guides" in aligned.stages)
+            return Denoised(aligned.centre.irradiance * aligned.modulation)
 
     for stages in ({"warp"}, {"warp", "clean-guides"}):
         shot = open_shot(SCENE.write(tmp_path / "in"))
@@ -84,7 +84,7 @@ def test_only_a_network_that_relies_on_clean_guides_gets_them(preset, tmp_path, 
     folder = SCENE.write(tmp_path)
     denoiser = open_network(shipped_weights(preset), precision="float32")
     seen = []
-    monkeypatch.setattr(unet_denoiser, "clean_guides", lambda aligned: seen.append(aligned) or aligned.guides)
+    monkeypatch.setattr(unet_denoiser, "clean_guides", lambda aligned: seen.append(aligned) or aligned.centre.guides)
     aligner = FrameStream(open_shot(folder), only({"warp"}), radius=denoiser.radius, first_pass=Classical(DRAFT))
     denoiser(aligner.align(SCENE.first + 2))
     assert bool(seen) == (preset == "quality")
