@@ -79,6 +79,13 @@ RIVALS = {"fast": "oidn-high", "balanced": "oidn-best", "quality": "oidn-best"}
 # Shots whose noise is correlated by the kernel [r 1 r] in both directions, at 32 samples.
 FILTERED = ("classroom", "staircase")
 RADII = (0.1, 0.2, 0.3, 0.45)
+# Shots of other renderers (`benchmarks/other_renderers.py`): level and options of each.
+OTHERS: dict[str, tuple[str, ...]] = {
+    "mitsuba": ("s032", "mitsuba"),
+    "luxcore-bidir": ("s016", "luxcore-bidir", "--samples", "16"),
+    "mitsuba-box": ("s032", "mitsuba", "--filter", "box"),
+    "luxcore-path": ("s016", "luxcore-path", "--samples", "16"),
+}
 LIGHT = ("Combined", "Denoising Albedo", "Denoising Normal")
 TIMED_FRAMES = 4
 Results = dict[str, Any]
@@ -133,9 +140,15 @@ class Record:
 
 
 def find_shot(name: str, options: argparse.Namespace) -> Path:
-    """The folder of a shot of the ladder, rendered if it is not there."""
+    """The folder of a shot, rendered if it is not there."""
     folder: Path = options.work / "shots" / name
-    if not any(folder.glob("reference_b.*.exr")):
+    if (folder / "reference_b.0005.exr").exists() and any(folder.glob("s*.0007.exr")):
+        return folder
+    if name in OTHERS:
+        _, renderer, *words = OTHERS[name]
+        script = str(ROOT / "benchmarks" / "other_renderers.py")
+        subprocess.run([sys.executable, script, renderer, str(folder), *words, "--references", "256"], check=True)
+    else:
         scene, *words = LADDER[name]
         if scene.endswith(".blend"):
             if options.scenes is None:
@@ -178,6 +191,8 @@ def spread(folder: Path, out: Path, radius: float) -> None:
 
 
 def measure_filters(record: Record, options: argparse.Namespace) -> None:
+    for name, (level, *_) in OTHERS.items():
+        judge(record, "filters", name, ladder.Truth(find_shot(name, options)), level, NAMES)
     for name, radius in product(FILTERED, RADII):
         if f"{name} {radius} quality" not in record.values.get("filters", {}):
             with tempfile.TemporaryDirectory() as folder:
@@ -297,11 +312,11 @@ def given(results: Results) -> str:
 
 
 def filters(results: Results) -> str:
-    """Results: shots whose pixels share noise."""
+    """Results: shots whose pixels share noise, and the two renderers' shots where they do not."""
+    names = list(dict.fromkeys(key.rpartition(" ")[0] for key in results["filters"]))
     rows = [
-        [f"*{name}*, r = {radius}", *(_pair(results["filters"][f"{name} {radius} {method}"]) for method in NAMES)]
-        for name in FILTERED
-        for radius in RADII
+        [re.sub(r"^(\w+) ([\d.]+)$", r"*\1*, r = \2", name), *(_pair(results["filters"][f"{name} {m}"]) for m in NAMES)]
+        for name in names
     ]
     return _rows(("shot", *NAMES.values()), rows)
 
