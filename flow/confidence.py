@@ -174,7 +174,7 @@ def local_variance(albedo: np.ndarray | None, normal: np.ndarray | None) -> np.n
 
 
 def outline_variance(variance: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """Variance (H, W, 2) of outlines: without what the noise makes of it, by the `compare_guides` with a neighbour."""
+    """Variance (H, W, 2) of the guides without the noise's part, estimated from the `distance` to a neighbour."""
     outlines = np.asarray(cv2.blur(distance, (3, 3)), np.float32).reshape(distance.shape)
     outlines *= np.float32(-_NOISE_IN_VARIANCE)
     outlines += variance

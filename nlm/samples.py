@@ -31,10 +31,10 @@ _APART = 6
 # Where no neighbour is trusted, the noise counts this many times: no frame denoised alone, at 8 to 512 samples, then
 # loses 0.01 dB; at 1 one loses 0.4.
 _ALONE = 1.5
-# Where so much of what is lit is trusted, noise elsewhere is at most so many times the greatest there: without noise
-# lines of a pixel at a rim that no other frame shows are no noise. This holds for noise of a few hundredths: where it
-# is greater, a place may have ten times that of all others (0.5 dB of the last frame of a shot at 8 samples). Bounds by
-# what is trusted nearby cost a shot of hair and glass 0.9 dB.
+# If at least 80 % of the lit pixels are trusted, the variance of the others is capped at twice the largest trusted one:
+# otherwise one-pixel detail at rims that no neighbour shows is mistaken for noise. This holds for noise of a few
+# hundredths: where it is greater, a place may have ten times that of all others (0.5 dB of the last frame of a shot at
+# 8 samples). Bounds by what is trusted nearby cost a shot of hair and glass 0.9 dB.
 _MOSTLY, _GREATEST, _SMALL = 0.8, np.float32(2), np.float32(0.003)
 # Deviation, pixels, of the Gaussian that averages errors and variances: over 200 pixels. Over fewer, noise of few
 # bright samples exceeds its own variance.
