@@ -6,6 +6,7 @@ import webbrowser
 
 import typer
 
+from hybrid.commands.log import LOG, one_line
 from hybrid.commands.options import command
 from hybrid.viewer.sequence import Sequence
 from hybrid.viewer.server import ViewServer
@@ -22,7 +23,7 @@ def view(output: str, beside: list[str] | None = None, fps: float = 24, port: in
             raise FileNotFoundError(f"no frames in {sequence.spec}")
     for sequence in sequences:
         sequence.check_sizes()
-    with ViewServer(sequences, rate=fps, port=port) as server:
+    with ViewServer(sequences, rate=fps, port=port, report=lambda error: LOG.error(one_line(error))) as server:
         typer.echo(f"{server.url}\nCtrl-C ends it")
         screen = sys.platform in ("darwin", "win32") or {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
         if browser and screen:

@@ -19,6 +19,17 @@ def encode_srgb(linear: NDArray[Any]) -> Array:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
+def encode_filmic(linear: NDArray[Any]) -> Array:
+    """Encode light (..., 3) as film shows it, much as AgX: eight stops of highlights, and bright colors turn white.
+
+    sRGB of y / (y + k) with y = (0.85 x + 0.15 mean x)^1.25, where k keeps middle gray, 0.18, as it is.
+    """
+    light = np.maximum(linear, 0).astype(np.float32)
+    mixed = (0.85 * light + 0.15 * light.mean(axis=-1, keepdims=True)) ** 1.25
+    k = 0.18**1.25 * (1 / 0.18 - 1)
+    return encode_srgb(1 - k / (mixed + k))  # 1 for infinity
+
+
 # From 16 bits to 8; near black a step of 16 linear bits is a twentieth of a step of 8 sRGB bits.
 _CODES = np.round(encode_srgb(np.arange(2**16) / (2**16 - 1)) * 255).astype(np.uint8)
 

@@ -6,7 +6,7 @@ const AHEAD = 6; // frames that are loaded before they are played
 
 const $ = (selector) => document.querySelector(selector);
 
-// A source of the player, which chooses { sequence, layer } for each side.
+// A source of the player, which chooses { sequence, layer, ev, view } for each side; `ev` adds to that of the player.
 class Frames {
   constructor() {
     this.sequences = [];
@@ -19,15 +19,16 @@ class Frames {
     return this.shape;
   }
 
-  label({ sequence, layer }) {
-    return [`${this.sequences[sequence]?.name ?? ""} · ${layer}`];
+  label({ sequence, layer, ev, view }) {
+    const shown = [...(view === "filmic" ? ["filmic"] : []), ...(ev ? [`${ev > 0 ? "+" : "−"}${Math.abs(ev)} EV`] : [])];
+    return [[this.sequences[sequence]?.name ?? "", layer, ...shown].join(" · ")];
   }
 
   // null where the sequence has no such frame.
-  address({ sequence, layer }, index, { ev }, kind) {
+  address({ sequence, layer, ev: own, view }, index, { ev }, kind) {
     const number = this.frames[index], version = this.sequences[sequence]?.frames[number];
     if (version === undefined || !layer) return null;
-    return `frame/${sequence}/${number}.${kind}?layer=${encodeURIComponent(layer)}&ev=${ev}&version=${version}`;
+    return `frame/${sequence}/${number}.${kind}?layer=${encodeURIComponent(layer)}&ev=${ev + own}&view=${view}&version=${version}`;
   }
 
   // The picture of an address, loaded if it is not in the cache.
@@ -122,7 +123,8 @@ class ViewPlayer extends Player {
       const picture = source.current(side, state);
       return picture === null ? `frame ${number} of ${source.sequences[side.sequence]?.name} does not exist yet` : picture.error;
     });
-    $("#message").textContent = [...new Set(missing.filter(Boolean))].join("; ");
+    const errors = source.sequences.map(({ error }) => error);
+    $("#message").textContent = [...new Set([...missing, ...errors].filter(Boolean))].join("; ");
     this.canvas.dataset.frame = number ?? "";
     this.canvas.dataset.exact = [left, right].every((side) => source.isExact(side, state));
     if (!state.playing) showFacts();
@@ -130,7 +132,7 @@ class ViewPlayer extends Player {
 }
 
 const source = new Frames();
-const side = { sequence: 0, layer: "" };
+const side = { sequence: 0, layer: "", ev: 0, view: "srgb" };
 const player = new ViewPlayer(source, { flipMs: 0, state: { left: side, right: side } });
 
 // --- what the server sends --------------------------------------------------------------------------------
@@ -140,7 +142,9 @@ let last = "";
 async function poll() {
   let text;
   try {
-    text = await (await fetch("state")).text();
+    const answer = await fetch("state");
+    text = await answer.text();
+    if (!answer.ok) return void ($("#message").textContent = text);
   } catch {
     $("#message").textContent = "the server has ended";
     return;
@@ -152,7 +156,7 @@ async function poll() {
   source.frames = [...new Set(sequences.flatMap(({ frames }) => Object.keys(frames).map(Number)))].sort((a, b) => a - b);
   const { left, right } = player.state;
   if (first) $("#rate").value = rate;
-  const sides = [first ? { sequence: sequences.length > 1 ? 1 : 0, layer: "" } : left, right].map(withLayer);
+  const sides = [first ? { ...left, sequence: sequences.length > 1 ? 1 : 0 } : left, right].map(withLayer);
   drawFinished();
   showRecord();
   $("#count").textContent = `${Object.keys(sequences[0].frames).length} of ${source.frames.length} frames are finished`;
@@ -160,17 +164,19 @@ async function poll() {
 }
 
 // The side with a layer that its sequence has.
-function withLayer({ sequence, layer }) {
-  const { layers, layer: first } = source.sequences[sequence];
-  return { sequence, layer: layers.includes(layer) ? layer : first };
+function withLayer(side) {
+  const { layers, layer: first } = source.sequences[side.sequence];
+  return { ...side, layer: layers.includes(side.layer) ? side.layer : first };
 }
 
 function choose(change) {
   player.update(change);
   for (const name of ["left", "right"]) {
-    const { sequence, layer } = player.state[name], box = $(`[data-side="${name}"]`);
+    const { sequence, layer, ev, view } = player.state[name], box = $(`[data-side="${name}"]`);
     fill(box.querySelector(".sequence"), source.sequences.map((each, index) => [index, each.name]), sequence);
     fill(box.querySelector(".layer"), source.sequences[sequence].layers.map((each) => [each, each]), layer);
+    box.querySelector(".ev").value = ev;
+    box.querySelector(".view").value = view;
   }
 }
 
@@ -259,11 +265,14 @@ async function readOut(event) {
 for (const name of ["left", "right"]) {
   const box = $(`[data-side="${name}"]`);
   box.querySelector(".sequence").addEventListener("change", ({ target }) => {
-    choose({ [name]: withLayer({ sequence: Number(target.value), layer: "" }) });
+    choose({ [name]: withLayer({ ...player.state[name], sequence: Number(target.value), layer: "" }) });
   });
-  box.querySelector(".layer").addEventListener("change", ({ target }) => {
-    choose({ [name]: { ...player.state[name], layer: target.value } });
-  });
+  for (const field of ["layer", "ev", "view"]) {
+    box.querySelector(`.${field}`).addEventListener("change", ({ target }) => {
+      const value = field === "ev" ? clamp(target.valueAsNumber || 0, -12, 12) : target.value;
+      choose({ [name]: { ...player.state[name], [field]: value } });
+    });
+  }
 }
 player.swap = () => choose({ left: player.state.right, right: player.state.left });
 Object.assign(player.keys, {

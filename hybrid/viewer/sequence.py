@@ -4,7 +4,7 @@ import math
 import os
 import threading
 from collections import OrderedDict
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,9 @@ from hybrid.alignment.transfer import measure_exposure
 from hybrid.files.decode import Window, data_window, display_size, place
 from hybrid.files.exr import MAX_PIXELS, ExrError, ExrImage, Layer, component_of, read_exr
 from hybrid.files.layers import Layers, find_colors, find_layers
-from hybrid.files.png import Image8, encode_srgb
+from hybrid.files.png import Image8, encode_filmic, encode_srgb
 from hybrid.files.profile import find_profile
-from hybrid.files.sequences import find_files, parse_frames
+from hybrid.files.sequences import Pattern, find_files, list_patterns, parse_frames, pattern_of
 from hybrid.files.sources import MADE_FROM, parse_object
 from hybrid.records import read_records, sequence_name
 from nlm.average import replace_nonfinite
@@ -29,12 +29,20 @@ CACHE_BYTES = 512 * 2**20
 LARGEST_SIDE = 65500  # pixels of a JPEG
 
 
-class Sequence:
-    """Frames, if any yet, of a pattern, folder or file; of `finished` ones the denoised layer is the first choice."""
+# How radiance is encoded.
+VIEWS: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {"srgb": encode_srgb, "filmic": encode_filmic}
 
-    def __init__(self, spec: str, *, finished: bool) -> None:
-        self.spec = spec
+
+class Sequence:
+    """Frames, if any yet, of a pattern, folder or file; of `finished` ones the denoised layer is the first choice.
+
+    `pattern` is that of one sequence of a folder; None for the first one there.
+    """
+
+    def __init__(self, spec: str, *, finished: bool, pattern: Pattern | None = None) -> None:
+        self.spec = spec  # with the pattern if the folder has several
         self.finished = finished
+        self._given, self._pattern = spec, pattern
         self._files: dict[int, Path] = {}
         self._cache: OrderedDict[Hashable, NDArray[Any]] = OrderedDict()
         self._ranges: dict[str, tuple[float, float]] = {}
@@ -43,12 +51,36 @@ class Sequence:
     def files(self) -> dict[int, Path]:
         """Return the files that exist now, by frame number."""
         try:
-            found, frames = find_files(self.spec)
+            found, frames = (self._in_folder(), None) if Path(self._given).is_dir() else find_files(self._given)
         except FileNotFoundError:
             found, frames = {}, None
         wanted = found.keys() if frames is None else found.keys() & set(parse_frames(frames))
         self._files = {number: found[number] for number in wanted}
         return self._files
+
+    def _in_folder(self) -> dict[int, Path]:
+        folder = Path(self._given)
+        if not (patterns := list_patterns(folder)):
+            return {}
+        own = self._pattern
+        self._pattern = next(
+            (p for p in patterns if own and (p.before, p.after) == (own.before, own.after)), patterns[0]
+        )
+        if len(patterns) > 1:
+            self.spec = str(folder / str(self._pattern))
+        return self._pattern.files()
+
+    @property
+    def key(self) -> tuple[Path, str, str] | None:
+        """What tells the sequence from others: folder, and the name around the number; None without frames."""
+        path = next(iter(self._files.values()), None)
+        return None if path is None else (path.parent.resolve(), pattern_of(path).before, pattern_of(path).after)
+
+    def others(self) -> "list[Sequence]":
+        """Return all sequences of the folder, if it is one."""
+        folder, finished = Path(self._given), self.finished
+        patterns = list_patterns(folder) if folder.is_dir() else []
+        return [Sequence(self._given, finished=finished, pattern=pattern) for pattern in patterns]
 
     def versions(self) -> dict[int, str]:
         """Return a version of each file, by frame number, that changes when the file is replaced."""
@@ -80,18 +112,19 @@ class Sequence:
         color, _ = replace_nonfinite(image.pixels(_layers(image).color.channels))
         return float(measure_exposure(color) / 0.18)
 
-    def picture(self, number: int, name: str, gain: float, ev: float) -> Image8:
+    def picture(self, number: int, name: str, gain: float, ev: float, view: str = "srgb") -> Image8:
         """Return a layer of a frame as an (H, W, 3) 8-bit image on the display window, black outside the data.
 
-        Radiance is multiplied by `gain`, albedo and single channels are brightened by `ev` stops; radiance and albedo
-        are sRGB encoded. Vectors have their zero at middle gray. Single channels are gray: in [0, 1] unchanged, others
-        scaled, like vectors, by the range of the first frame that was shown. KeyError if there is no such frame or
-        layer; OSError or ExrError if the file cannot be read, for instance because it is incomplete so far.
+        Radiance is multiplied by `gain`, albedo and single channels are brightened by `ev` stops; radiance is encoded
+        by the `view`, one of `VIEWS`, albedo by sRGB. Vectors have their zero at middle gray. Single channels are gray:
+        in [0, 1] unchanged, others scaled, like vectors, by the range of the first frame that was shown. KeyError if
+        there is no such frame, layer or view; OSError or ExrError if the file cannot be read, for instance because it
+        is incomplete so far.
         """
         image, layer, pixels = self._read_layer(number, name)
         part = image.parts[layer.part]
         width, height = display_size(part)
-        encoded = self._encode(pixels, layer, _layers(image), gain, ev)
+        encoded = self._encode(pixels, layer, _layers(image), gain, ev, VIEWS[view])
         return place(encoded, data_window(part), Window(0, 0, width - 1, height - 1))
 
     def values(self, number: int, name: str, x: int, y: int) -> dict[str, float | None]:
@@ -149,12 +182,22 @@ class Sequence:
     def _path(self, number: int) -> Path:
         return self._files[number] if number in self._files else self.files()[number]
 
-    def _encode(self, pixels: NDArray[Any], layer: Layer, taken: Layers, gain: float, ev: float) -> Image8:
+    def _encode(
+        self,
+        pixels: NDArray[Any],
+        layer: Layer,
+        taken: Layers,
+        gain: float,
+        ev: float,
+        encode: Callable[[NDArray[Any]], NDArray[Any]],
+    ) -> Image8:
         components = [component_of(channel) for channel in layer.channels]
         roles = {kind.name: role for role, kind in vars(taken).items() if isinstance(kind, Layer)}
         shown: NDArray[Any]
         if components[:3] == ["R", "G", "B"]:
-            shown = encode_srgb(pixels[..., :3] * np.float32(2**ev if roles.get(layer.name) == "albedo" else gain))
+            is_albedo = roles.get(layer.name) == "albedo"
+            light = pixels[..., :3] * np.float32(2**ev if is_albedo else gain)
+            shown = (encode_srgb if is_albedo else encode)(light)
         elif len(components) > 1:
             vectors = pixels[..., : 3 if len(components) == 3 else 2]  # the last two of four point to another frame
             low, high = self._range(layer.name, vectors)

@@ -9,6 +9,8 @@ import json
 import secrets
 import socket
 import sys
+import threading
+from collections.abc import Callable
 from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
@@ -41,14 +43,26 @@ KINDS = {"png": "image/png", "jpg": "image/jpeg"}
 
 
 class ViewServer(ThreadingHTTPServer):
-    """Serves sequences (the first is the result) to a browser on this machine; port 0: any free port."""
+    """Serves sequences (the first is the result) to a browser on this machine; port 0: any free port.
+
+    Other sequences of a folder that is named, also later ones, follow. `report` is called with each error, once.
+    """
 
     daemon_threads = True
     allow_reuse_address = sys.platform != "win32"  # there it lets two servers share a port
 
-    def __init__(self, sequences: list[Sequence], *, rate: float = 24, port: int = 0) -> None:
-        self.sequences = sequences
+    def __init__(
+        self,
+        sequences: list[Sequence],
+        *,
+        rate: float = 24,
+        port: int = 0,
+        report: Callable[[Exception], object] = lambda error: None,
+    ) -> None:
+        self.sequences, self._named = [*sequences], tuple(sequences)
         self.rate = rate
+        self._report, self._reported = report, set[str]()
+        self._lock = threading.Lock()
         self.secret = secrets.token_urlsafe(16)
         self._exposure: float | None = None
         super().__init__((LOOPBACK, port), _Handler)
@@ -74,7 +88,7 @@ class ViewServer(ThreadingHTTPServer):
     @property
     def exposure(self) -> float:
         """Divisor of radiance at 0 EV for all sequences, from the middle frame of the last sequence that has frames."""
-        for sequence in reversed(self.sequences) if self._exposure is None else ():
+        for sequence in reversed(self._named) if self._exposure is None else ():
             if numbers := sorted(sequence.files()):
                 with suppress(OSError, ExrError):  # incomplete so far
                     self._exposure = sequence.exposure(numbers[len(numbers) // 2])
@@ -83,14 +97,40 @@ class ViewServer(ThreadingHTTPServer):
 
     def state(self) -> dict[str, Any]:
         """Return the current frames with their versions, the layers, and the record of the run."""
+        self._add_others()
         names = [Path(sequence.spec).name for sequence in self.sequences]
         if len(set(names)) < len(names):  # noisy/shot.####.exr and denoised/shot.####.exr
             names = ["/".join(Path(sequence.spec).parts[-2:]) for sequence in self.sequences]
         described = [{"name": n, **self._describe(s)} for n, s in zip(names, self.sequences, strict=True)]
         return {"rate": self.rate, "sequences": described}
 
+    def _add_others(self) -> None:
+        """Append the sequences that the named folders have beside those that are served."""
+        with self._lock, suppress(OSError, ValueError):  # said where the sequence is described
+            found = [*self._named, *(other for sequence in self._named for other in sequence.others())]
+            for sequence in found:
+                sequence.files()
+            known = {sequence.key for sequence in self.sequences}
+            self.sequences += [sequence for sequence in found if sequence.key not in known]
+
+    def report(self, error: Exception) -> None:
+        """Report an error, unless it was reported before."""
+        if str(error) not in self._reported:
+            self._reported.add(str(error))
+            self._report(error)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Report an error of a connection, but not that the browser has closed it."""
+        error = sys.exception()
+        if isinstance(error, Exception) and not isinstance(error, ConnectionError):
+            self.report(error)
+
     def _describe(self, sequence: Sequence) -> dict[str, Any]:
-        versions = sequence.versions()
+        try:
+            versions, error = sequence.versions(), ""
+        except (OSError, ValueError) as fault:
+            self.report(fault)
+            versions, error = {}, str(fault)
         layers: list[str] = []
         first = ""
         for number in versions:
@@ -98,7 +138,7 @@ class ViewServer(ThreadingHTTPServer):
                 layers, first = sequence.layers(number)
                 break
         record = sequence.record() if sequence.finished else {}
-        return {"frames": versions, "layers": layers, "layer": first, "record": record}
+        return {"frames": versions, "layers": layers, "layer": first, "record": record, "error": error}
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -117,14 +157,14 @@ class _Handler(BaseHTTPRequestHandler):
             return
         try:
             code, kind, body, lasting = self._find(rest, parse_qs(parts.query))
+        except (ExrError, OSError) as error:  # the page may ask again: the file may be incomplete so far
+            self._fail(409, error)
         except (KeyError, IndexError, ValueError) as error:
-            # The page may request a damaged file again: it may be incomplete so far.
-            code = 409 if isinstance(error, ExrError) else 404
-            self._answer(code, "text/plain; charset=utf-8", str(error).encode())
+            self._answer(404, "text/plain; charset=utf-8", str(error).encode())
         except MemoryError as error:
-            self._answer(507, "text/plain; charset=utf-8", f"not enough memory: {error}".encode())
-        except OSError as error:
-            self._answer(409, "text/plain; charset=utf-8", str(error).encode())
+            self._fail(507, MemoryError(f"not enough memory: {error}"))
+        except Exception as error:
+            self._fail(500, error)
         else:
             self._answer(code, kind, body, lasting=lasting)
 
@@ -152,8 +192,13 @@ class _Handler(BaseHTTPRequestHandler):
         ev = float(query["ev"][0])
         if not -32 <= ev <= 32:  # NaN is refused as well
             raise ValueError(f"ev is {ev}, expected -32 to 32")
-        picture = sequence.picture(int(number), query["layer"][0], 2**ev / self.server.exposure, ev)
+        gain, view = 2**ev / self.server.exposure, query.get("view", ["srgb"])[0]
+        picture = sequence.picture(int(number), query["layer"][0], gain, ev, view)
         return 200, KINDS[suffix], encode_picture(picture, suffix), "version" in query  # of the file
+
+    def _fail(self, code: int, error: Exception) -> None:
+        self.server.report(error)
+        self._answer(code, "text/plain; charset=utf-8", str(error).encode())
 
     def _answer(self, code: int, kind: str, body: bytes, *, lasting: bool = False) -> None:
         self.send_response(code)
@@ -166,4 +211,4 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: object) -> None:
-        """Log nothing: the terminal belongs to the user."""
+        """Log no request: the terminal belongs to the user."""

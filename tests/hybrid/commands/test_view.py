@@ -1,10 +1,12 @@
 """`ravg view` as a command: its address, what it refuses, how it ends."""
 
+import json
 import os
 import re
 import signal
 import subprocess
 import sys
+import urllib.error
 import urllib.request
 from pathlib import Path
 
@@ -49,10 +51,35 @@ def test_a_sequence_beside_must_be_there(shot_folder, tmp_path, capsys):
     assert f"no frames in {tmp_path / 'gone'}" in " ".join(capsys.readouterr().err.split())
 
 
-def test_two_sequences_in_one_folder_are_told_apart_by_the_user(shot_folder, capsys):
-    (shot_folder / "other.1001.exr").write_bytes((shot_folder / "shot.1001.exr").read_bytes())
-    assert main(["view", str(shot_folder)]) == 1
-    assert "several sequences" in capsys.readouterr().err
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT for other processes")
+@pytest.mark.usefixtures("interrupts")
+def test_a_second_sequence_is_offered_and_errors_are_one_line_in_the_terminal(shot_folder):
+    """A folder with two was refused, and one that came later ended the page, without a word in the terminal."""
+    words = [sys.executable, "-m", "hybrid.cli", "view", str(shot_folder), "--no-browser"]
+    process = subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, env=os.environ
+    )
+    try:
+        assert process.stdout is not None
+        url = process.stdout.readline().strip()
+
+        def names():
+            with urllib.request.urlopen(url + "state", timeout=30) as answer:
+                return [sequence["name"] for sequence in json.load(answer)["sequences"]]
+
+        assert names() == ["noisy"]
+        damaged = shot_folder / "also.1001.exr"
+        damaged.write_bytes((shot_folder / "shot.1001.exr").read_bytes()[:-2000])
+        assert names() == ["shot.####.exr", "also.####.exr"]
+        for _ in range(2):
+            with pytest.raises(urllib.error.HTTPError, match="409"):
+                urllib.request.urlopen(f"{url}frame/1/1001.png?layer=ViewLayer.Combined&ev=0", timeout=30)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=30)
+        assert process.returncode == 0
+        assert re.fullmatch(f"error: {damaged}: damaged .*\n", said)
+    finally:
+        process.kill()
 
 
 def test_frames_that_are_too_large_to_be_shown_end_it_in_one_line(tmp_path, capsys):

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from hybrid.files.png import encode_bytes, encode_srgb, write_png
+from hybrid.files.png import encode_bytes, encode_filmic, encode_srgb, write_png
 
 
 def test_a_png_holds_the_srgb_values_in_their_order(tmp_path):
@@ -23,3 +23,15 @@ def test_the_table_of_8_bits_gives_what_the_formula_gives():
     # Half a step of 8 bits for rounding, and half of a table's step, a twentieth at most.
     assert np.abs(table - formula).max() < 0.5 + 0.03
     assert np.array_equal(table[0, [0, -1], 0], [0, 255])
+
+
+def test_filmic_keeps_middle_gray_the_order_of_light_and_highlights():
+    ramp = np.geomspace(1e-4, 1e4, 200, dtype=np.float32)[:, None].repeat(3, axis=1)
+    shown = encode_filmic(ramp)
+    assert (np.diff(shown[:, 0]) >= 0).all()
+    np.testing.assert_allclose(encode_filmic(np.full(3, 0.18)), encode_srgb(np.full(3, 0.18)), rtol=1e-5)
+    assert 0.9 < encode_filmic(np.full(3, 0.18 * 2**5))[0] < encode_filmic(np.full(3, 0.18 * 2**7))[0] < 1
+    red = encode_filmic(np.float32([100, 0, 0]))
+    assert red[0] > red[1] > 0.9, "bright colors turn white"
+    np.testing.assert_allclose(encode_filmic(np.float32([np.inf] * 3)), 1)
+    np.testing.assert_array_equal(encode_filmic(np.float32([-1, -1, -1])), 0)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hybrid.files.png import encode_srgb
+from hybrid.files.png import encode_filmic, encode_srgb
 from hybrid.records import Record
 from hybrid.runtime.timing import Stage, Timings
 from hybrid.viewer.sequence import Sequence
@@ -146,6 +146,30 @@ def test_exposure_is_in_stops(page, served):
     assert page.text_content("#ev-text") == "+1.00 EV"
     settle(page, 1)
     assert pixel(page, 0.25) == level(served, GRAY, 1)
+
+
+def test_each_side_has_an_exposure_and_a_view(page, served):
+    page.fill('[data-side="right"] .ev', "-1")
+    page.press('[data-side="right"] .ev', "Tab")
+    page.select_option('[data-side="left"] .view', "filmic")
+    settle(page, 1)
+    filmic = encode_filmic(np.full(3, GRAY / served.exposure, np.float32))
+    assert pixel(page, 0.25) == pytest.approx(list(np.round(filmic * 255)), abs=1)
+    assert pixel(page, 0.25) != level(served, GRAY)
+    assert pixel(page, 0.75) == level(served, GRAY / 2, -1)
+    labels = [page.text_content(f"#labels div:nth-child({n})") for n in (1, 2)]
+    assert labels == ["noisy · ViewLayer.Combined · filmic", "out · ViewLayer.Combined · −1 EV"]
+    page.click("#swap")
+    settle(page, 1)
+    assert page.input_value('[data-side="right"] .view') == "filmic"
+
+
+def test_a_sequence_that_comes_into_the_folder_is_offered(page, shot):
+    path = shot / "out" / "other.0001.exr"
+    path.write_bytes(next((shot / "out").glob("*.exr")).read_bytes())
+    page.wait_for_selector(
+        '[data-side="left"] .sequence option:nth-child(3):has-text("other.####.exr")', state="attached"
+    )
 
 
 def test_layers_can_be_chosen_on_either_side(page):

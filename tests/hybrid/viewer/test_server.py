@@ -64,6 +64,40 @@ def test_equal_names_are_told_apart(tmp_path):
     assert names == ["noisy/shot.####.exr", "denoised/shot.####.exr"]
 
 
+def test_sequences_of_a_folder_follow_those_that_are_named(served, tmp_path):
+    assert [each["name"] for each in served.state()["sequences"]] == ["out", "noisy"]
+    for name in ("other.1001.exr", "other.1002.exr"):
+        (tmp_path / "out" / name).write_bytes((tmp_path / "out" / name.replace("other", "shot")).read_bytes())
+    for _ in range(2):
+        sequences = served.state()["sequences"]
+        assert [each["name"] for each in sequences] == ["shot.####.exr", "noisy", "other.####.exr"]
+        assert [*sequences[0]["frames"]] == [*sequences[2]["frames"]] == [1001, 1002]
+    assert ask(served, f"frame/2/1001.png?layer={COMBINED}&ev=0")[0] == 200
+
+
+def test_a_sequence_that_cannot_be_read_is_said_beside_the_others(served, monkeypatch):
+    def refuse(self):
+        raise ValueError("two files have one number")
+
+    said = []
+    monkeypatch.setattr(served, "_report", said.append)
+    monkeypatch.setattr(served.sequences[1], "versions", refuse.__get__(served.sequences[1]))
+    for _ in range(2):
+        out, noisy = served.state()["sequences"]
+    assert (out["error"], len(out["frames"])) == ("", 2)
+    assert (noisy["error"], noisy["frames"]) == ("two files have one number", {})
+    assert len(said) == 1
+
+
+def test_a_bug_is_one_line_of_the_terminal_and_an_answer(served, monkeypatch):
+    said = []
+    monkeypatch.setattr(served, "_report", said.append)
+    monkeypatch.setattr(Sequence, "facts", lambda *_: 1 / 0)
+    for _ in range(2):
+        assert ask(served, "facts/0/1001.json")[0] == 500
+    assert [str(error) for error in said] == ["division by zero"]
+
+
 def test_frames_are_pictures_with_one_exposure(served):
     """Both sequences are exposed by the noisy one's middle frame, to a mean of 0.18."""
     status, headers, body = ask(served, f"frame/0/1001.png?layer={COMBINED}&ev=0&version=x")
@@ -131,6 +165,7 @@ def test_nothing_is_given_without_the_secret(served, path):
         "frame/0/1001.png?layer=ViewLayer.Combined&ev=nan",
         "frame/0/1001.png?layer=ViewLayer.Combined&ev=1e9",
         "frame/0/1001.png?layer=ViewLayer.Combined&ev=x",
+        "frame/0/1001.png?layer=ViewLayer.Combined&ev=0&view=x",
         "facts/0/1001.txt",
         "values/0/1001.json",
         "values/0/1001.json?layer=ViewLayer.Combined&x=a&y=0",
