@@ -18,7 +18,7 @@ from hybrid.comparison.animations import file_name
 from hybrid.comparison.compare import CompareOptions, compare_shot, count_steps
 from hybrid.comparison.embedding import ShotImages
 from hybrid.comparison.ladder import join_ladders
-from hybrid.comparison.methods import METHODS, Method
+from hybrid.comparison.methods import DEFAULTS, METHODS, Method
 from hybrid.comparison.methods import external as finished
 from hybrid.comparison.results import Comparison, Cost, join, read_comparison
 from hybrid.comparison.running import run_in_process
@@ -201,7 +201,7 @@ def _methods(
     names: str | None, external: Sequence[str] | None, seconds: Mapping[str, float], shot: Shot, frames: str | None
 ) -> dict[str, Method]:
     """The requested methods, and sequences of other denoisers with their seconds per frame."""
-    wanted = METHODS if names is None else map(str.strip, names.split(","))
+    wanted = DEFAULTS if names is None else METHODS if names == "all" else map(str.strip, names.split(","))
     chosen = {name: opt.choose(METHODS, name, "methods") for name in wanted}
     for item in external or ():
         name, separator, pattern = item.partition("=")

@@ -6,6 +6,7 @@ import re
 import warnings
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from markupsafe import Markup
@@ -37,6 +38,7 @@ LONGEST_LABEL = 34
 ABOVE = ((-6, 5, "right", "bottom"), (0, 8, "center", "bottom"), (6, 5, "left", "bottom"))
 ASIDE = ((9, 0, "left", "center"), (-9, 0, "right", "center"))
 BELOW = ((0, -8, "center", "top"), (6, -5, "left", "top"), (-6, -5, "right", "top"))
+FARTHER = (1, 2.5, 4, 6, 8, 11, 14, 18, 23, 29)  # times these offsets, where that is taken, with a line to the point
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,7 @@ def _set_cost_axis(axes: Axes, costs: dict[int, float | None], cost: Cost) -> di
     axes.set_xlim(left, right)
     axes.set_xticks(ticks, texts)
     axes.minorticks_off()
-    axes.set_xlabel(f"{COSTS[cost]} →", loc="right")
+    axes.set_xlabel(f"← better: {COSTS[cost]}", loc="right")
     return {i: unknown if value is None else value / unit if value else free for i, value in costs.items()}
 
 
@@ -191,7 +193,7 @@ def _draw_lines(axes: Axes, points: Sequence[_Point]) -> None:
 
 
 def _draw_labels(figure: Figure, axes: Axes, points: Sequence[_Point], metric: Metric) -> None:
-    """Names of as many points as have space, the front's first; points of a sweep are named on the front only."""
+    """Names of all points, the front's first, farther off where it is crowded; of a sweep's those on the front only."""
     figure.draw_without_rendering()
     pixels = [axes.transData.transform((p.x, p.y)) for p in points]
     taken = [Bbox.from_bounds(x - 6, y - 6, 12, 12) for x, y in pixels]
@@ -206,18 +208,28 @@ def _draw_labels(figure: Figure, axes: Axes, points: Sequence[_Point], metric: M
         weight, color = ("bold", "#222") if p.on_front else ("normal", "#555")
         text = axes.annotate(words, (p.x, p.y), (0, 0), textcoords="offset points", annotation_clip=False, fontsize=9)
         text.set(weight=weight, color=color, parse_math=False, gid=f"name-{p.index}")
-        for dx, dy, horizontal, vertical in (*ABOVE, *ASIDE, *BELOW) if p.on_front else (*ASIDE, *BELOW, *ABOVE):
-            text.set(position=(dx, dy), horizontalalignment=horizontal, verticalalignment=vertical)
+        near = (*ABOVE, *ASIDE, *BELOW) if p.on_front else (*ASIDE, *BELOW, *ABOVE)
+        for farther, (dx, dy, horizontal, vertical) in product(FARTHER, near):
+            offset = farther * dx, farther * dy
+            text.set(position=offset, horizontalalignment=horizontal, verticalalignment=vertical)
             box = text.get_window_extent()
             if np.array_equal(Bbox.union([box, frame]).extents, frame.extents) and not box.count_overlaps(taken):
-                taken.append(box)
                 break
-        else:
-            text.remove()
+        taken.append(box)
+        if farther > FARTHER[0]:
+            start = axes.transData.transform((p.x, p.y))
+            end = axes.transData.inverted().transform(start + np.multiply(offset, figure.dpi / 72))
+            style = {"color": color, "linewidth": 0.5, "zorder": 1, "clip_on": False, "gid": f"bar-{p.index}"}
+            axes.plot(*zip((p.x, p.y), end, strict=True), scalex=False, scaley=False, **style)
 
 
-def draw_curves(results: Sequence[MethodResult], metric: Metric, pair: tuple[str, str] | None) -> Markup | None:
-    """Draw a measure over the frames, of all methods in gray and of a pair in color; None below three frames."""
+def draw_curves(
+    results: Sequence[MethodResult], metric: Metric, pair: tuple[str, str] | None, frames: Sequence[int]
+) -> Markup | None:
+    """Draw a measure over the frames, of all methods in gray and of a pair in color; None below three frames.
+
+    `frames` are the numbers of the frames; a measure of pairs of frames has a value less, at the later one.
+    """
     drawn = [r for r in results if metric.key in r.metrics and not r.sweep and r.family != INPUT_FAMILY]
     series = {r.name: r.metrics[metric.key].values for r in drawn}
     length = max(map(len, series.values()), default=0)
@@ -226,15 +238,17 @@ def draw_curves(results: Sequence[MethodResult], metric: Metric, pair: tuple[str
     figure = Figure(figsize=(WIDTH, 2.6), facecolor="none")
     axes = figure.add_axes((0.075, 0.16, 0.745, 0.72), facecolor="none")
     _set_measure_axis(axes, metric)
+    named = len(frames) - length in (0, 1)
+    numbers = frames[-length:] if named else range(1, length + 1)
     lines = sorted((name for name in series if len(series[name]) == length), key=lambda name: name in (pair or ()))
     for name in lines:
         color = COLORS[(pair or ()).index(name)] if name in (pair or ()) else "#88888866"
-        axes.plot(range(length), series[name], color=color, linewidth=1.6 if name in (pair or ()) else 0.8)
+        axes.plot(numbers, series[name], color=color, linewidth=1.6 if name in (pair or ()) else 0.8)
         if name in (pair or ()):
             place = 1.01, 0.9 - 0.12 * (pair or ()).index(name)
             axes.text(*place, name, transform=axes.transAxes, color=color, fontsize=9, parse_math=False)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_xlabel("frame of the shot, from 0 →", loc="right")
+    axes.set_xlabel("frame" if named else "frames in their order, from 1", loc="right")
     return to_svg(figure, f"curve-{metric.key}")
 
 
@@ -262,7 +276,8 @@ def draw_ladder(ladder: Ladder) -> Figure | None:
         axes.set_xticks(counts, [f"{n:g}" for n in counts])
         axes.xaxis.minorticks_off()
         axes.set_xlabel("samples per pixel →", loc="right")
-        axes.set_title(f"{ERRORS.get(metric.key, metric.label)}, better ↓", loc="left", fontsize=11)
+        axes.yaxis.set_inverted(True)  # better is up on every chart
+        axes.set_title(f"{ERRORS.get(metric.key, metric.label)}, better ↑", loc="left", fontsize=11)
         axes.grid(color="#88888833", linewidth=0.8)
         axes.tick_params(which="both", length=0, labelcolor="#555")
         axes.spines[["top", "left", "right"]].set_visible(False)

@@ -97,7 +97,8 @@ def compare_shot(
     }
     if findings:
         facts["Layers"] = "; ".join(findings)
-    return Comparison(options.title, tuple(results), facts | map_facts | _facts_of_runs(options, load), ladder)
+    facts |= map_facts | _facts_of_runs(options, load)
+    return Comparison(options.title, tuple(results), facts, ladder, tuple(numbers))
 
 
 def count_steps(methods: Mapping[str, Method], options: CompareOptions) -> int:

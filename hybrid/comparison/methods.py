@@ -235,8 +235,8 @@ METHODS: dict[str, Method] = {
     "gated": _aligned("Gated averages", gated_average, source="nlm"),
     "gated OIDN fast": _aligned("Gated averages", gated_average, source="oidn-fast"),
     "gated OIDN": _aligned("Gated averages", gated_average, source="oidn"),
-    "network without OIDN": _network("fast", "bundled"),
-    **{f"network {preset}": _network(preset, OIDN_MODE_OF_NETWORKS) for preset in NETWORKS},
+    "fast without OIDN": _network("fast", "bundled"),
+    **{preset: _network(preset, OIDN_MODE_OF_NETWORKS) for preset in NETWORKS},
     "tKPCN": _network("tkpcn", "none"),
     "OIDN fast": _oidn("fast"),
     "OIDN high": _oidn("high"),
@@ -245,3 +245,5 @@ METHODS: dict[str, Method] = {
     "OIDN balanced + clean guides": _oidn("balanced", prefilter="balanced"),
     "OIDN best + robust average": Method(oidn_then_average, "OIDN"),
 }
+# Those that run where none is named.
+DEFAULTS = ("noisy", "OIDN high", "OIDN best", "balanced", "quality")

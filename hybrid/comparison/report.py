@@ -27,6 +27,7 @@ from hybrid.comparison.results import (
     best_and_ties,
     join,
     leading_pair,
+    opening_pair,
     pareto_front,
     present_metrics,
     read_comparison,
@@ -129,15 +130,15 @@ def _page(
         **document,
         "chart": [m.key for m in charted],
         "cost": report.cost,
-        "pair": pair,
+        "opens": metrics and opening_pair(results, metrics[0]),
         "exposure": report.images.exposure if report.images is not None else 1.0,
         **{name: embedded[name] and embedded[name].info for name in ("pictures", "animations")},
     }
     return page.render(
         "report.html",
         comparison=comparison,
-        verdict=_verdict(results, metrics, pair),
-        curves=[(m, curve) for m in charted if (curve := chart.draw_curves(present, m, pair))],
+        verdict=_verdict(results, metrics, pair, report.cost),
+        curves=[(m, curve) for m in charted if (curve := chart.draw_curves(present, m, pair, comparison.frames))],
         metrics=metrics,
         charted=charted,
         costs=costs,
@@ -169,7 +170,7 @@ class Verdict(NamedTuple):
 
 
 def _verdict(
-    results: Sequence[MethodResult], metrics: Sequence[Metric], pair: tuple[str, str] | None
+    results: Sequence[MethodResult], metrics: Sequence[Metric], pair: tuple[str, str] | None, cost: Cost
 ) -> Verdict | None:
     best, ties = best_and_ties(results, metrics[0]) if metrics else (None, set())
     if best is None:
@@ -184,8 +185,8 @@ def _verdict(
             figures.append((tables.format_change(means[0] - means[1], gained), gained.unit, label))
     if leader.worth is not None and math.isfinite(leader.worth):
         figures.append((tables.format_worth(leader.worth), "", "worth in samples"))
-    if leader.seconds_per_megapixel is not None:
-        figures.append((tables.format_seconds(leader.seconds_per_megapixel), "s", "per megapixel and frame"))
+    if (spent := getattr(leader, cost)) is not None:
+        figures.append((tables.format_seconds(spent), "", COSTS[cost]))
     return Verdict(best, pair and pair[1], [r.name for r in results if r.name in ties], figures)
 
 

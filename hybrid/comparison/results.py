@@ -73,6 +73,7 @@ class Comparison:
     results: tuple[MethodResult, ...]
     facts: Mapping[str, str] = field(default_factory=dict)
     ladder: Ladder = field(default_factory=dict)  # of renders at several samples per pixel
+    frames: tuple[int, ...] = ()  # numbers of the frames that were measured, where there is one shot
 
 
 # Their definitions are in page/definitions.html.
@@ -202,6 +203,14 @@ class StageValue:
     cpu_seconds: float | None
 
 
+def opening_pair(results: Sequence[MethodResult], metric: Metric) -> tuple[str, str] | None:
+    """Name the noisy input and the best method of ours, or else the best of all, with which a page opens."""
+    ours = [r for r in results if r.family not in (INPUT_FAMILY, *OTHER_FAMILIES) and not r.sweep]
+    shown = best_and_ties(ours, metric)[0] or best_and_ties(results, metric)[0]
+    noisy = next((r.name for r in results if r.family == INPUT_FAMILY and r.name != shown), None)
+    return None if noisy is None or shown is None else (noisy, shown)
+
+
 def stage_values(results: Sequence[MethodResult]) -> list[StageValue]:
     """Compute the effect of each stage from the points of the sweep "Stages"."""
     by_name = {r.name: r for r in results if r.absent_reason is None}
@@ -266,6 +275,7 @@ def to_document(comparison: Comparison) -> dict[str, object]:
         "fronts": {f"{m.key} {cost}": pareto_front(results, m, cost) for m in metrics for cost in COSTS},
         "stages": [asdict(s) for s in stage_values(results)],
         "ladder": comparison.ladder,
+        "frames": comparison.frames,
     }
 
 
@@ -298,7 +308,7 @@ def read_comparison(path: Path) -> Comparison:
             str(key): {str(name): tuple((float(n), float(e)) for n, e in curve) for name, curve in curves.items()}
             for key, curves in document.get("ladder", {}).items()
         }
-        return Comparison(str(document["shot"]), results, facts, ladder)
+        return Comparison(str(document["shot"]), results, facts, ladder, tuple(map(int, document.get("frames", ()))))
     except (LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
         words = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise ValueError(f"{path} is no result of a comparison: {words}") from None

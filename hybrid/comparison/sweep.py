@@ -12,7 +12,7 @@ from hybrid.plan import Plan, Rules
 from hybrid.pseudo_reference import STANDARD, ClassicalPreset, filter_window
 
 # Methods that are varied: the middle classical preset, and networks.
-CLASSICAL, NETWORK, KERNELS = "standard", "network without OIDN", "tKPCN"
+CLASSICAL, NETWORK, KERNELS = "standard", "fast without OIDN", "tKPCN"
 
 RADII = (0, 1, 2, 3)  # windows of 1, 3, 5 and 7 frames
 SCALES, WARPS, ITERATIONS = (1, 3), (1, 3), (10, 30)  # of TV-L1

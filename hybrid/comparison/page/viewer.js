@@ -105,11 +105,10 @@ class Viewer extends Player {
   }
 }
 
-// The best method on the right, its strongest rival on the left; without their pictures the last, and the noisy frames.
+// The noisy frames on the left, our best method on the right; without their pictures the first and the last.
 function firstPair(names) {
-  const [leader, rival] = report.pair ?? [], place = (name) => names.indexOf(name);
-  const right = place(leader) >= 0 ? place(leader) : names.length - 1;
-  return { left: [rival, "noisy"].map(place).find((i) => i >= 0 && i !== right) ?? 0, right };
+  const [left, right] = (report.opens ?? []).map((name) => names.indexOf(name));
+  return { left: Math.max(left ?? 0, 0), right: right >= 0 ? right : names.length - 1 };
 }
 
 function firstState({ sources, frames, black, row }) {

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from hybrid.cli import main
-from hybrid.commands.compare import _open_levels, _seconds
+from hybrid.commands.compare import _methods, _open_levels, _seconds
 from hybrid.commands.shots import ShotInput
 from hybrid.comparison.methods import METHODS
 from hybrid.comparison.metrics import psnr
@@ -161,6 +161,14 @@ def write_noisy(folder: Path, seed: int, noise: float) -> Path:
         layers["ViewLayer.Combined"] = grained(layers["ViewLayer.Combined"], (seed, index), noise)
 
     return SMALL.write(folder, clean=True, edit=edit)
+
+
+def test_five_methods_run_where_none_is_named(shots: tuple[Path, Path]) -> None:
+    """All ran, for an hour, of which most are parts of others."""
+    shot = open_shot(str(shots[0]))
+    assert [*_methods(None, None, {}, shot, None)] == ["noisy", "OIDN high", "OIDN best", "balanced", "quality"]
+    assert _methods("all", None, {}, shot, None) == METHODS
+    assert [*_methods("fast, noisy", None, {}, shot, None)] == ["fast", "noisy"]
 
 
 def test_both_references_are_read(tmp_path: Path) -> None:

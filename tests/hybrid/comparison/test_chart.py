@@ -49,6 +49,8 @@ def test_better_is_up_dearer_is_right_and_the_axis_is_logarithmic(metric: Metric
     at = {r.name: pixel_of(figure, i) for i, r in enumerate(RESULTS[:5])}
     ten, eleven = pixel_of(figure, 6), pixel_of(figure, 7)
     assert at["final"][1] > at["average"][1] > at["noisy"][1]
+    assert figure.axes[0].get_title(loc="left").endswith("better ↑")
+    assert figure.axes[0].get_xlabel().startswith("← better")
     assert at["average"][0] - ten[0] == pytest.approx(at["slow"][0] - at["average"][0])  # 0.02, 0.2, 2
     assert at["noisy"][0] < ten[0] < eleven[0] < at["other"][0]  # costs nothing; unknown
     assert [tick.get_text() for tick in figure.axes[0].get_xticklabels()][-2:] == ["nothing", "unknown"]
@@ -58,10 +60,10 @@ def test_a_ladder_is_drawn_on_logarithmic_axes_from_its_errors() -> None:
     curve = ((8, 0.4), (32, 0.1), (128, 0.05))
     figure = chart.draw_ladder({"psnr": {"noisy": curve, "_ours": curve[:2]}, "flip": {"_ours": curve}})
     assert figure is not None
-    assert [axes.get_title(loc="left") for axes in figure.axes] == ["Squared error, better ↓", "FLIP, better ↓"]
+    assert [axes.get_title(loc="left") for axes in figure.axes] == ["Squared error, better ↑", "FLIP, better ↑"]
     first, second = figure.axes
     assert (first.get_xscale(), first.get_yscale()) == ("log", "log")
-    assert not first.yaxis_inverted()
+    assert first.yaxis_inverted()
     assert [tick.get_text() for tick in first.get_xticklabels()] == ["8", "32", "128"]
     np.testing.assert_array_equal(first.lines[0].get_xydata(), curve)
     assert first.lines[1].get_color() == second.lines[0].get_color() != first.lines[0].get_color()
@@ -69,13 +71,14 @@ def test_a_ladder_is_drawn_on_logarithmic_axes_from_its_errors() -> None:
     assert chart.draw_ladder({}) is None
 
 
-def test_labels_lie_inside_and_never_on_each_other() -> None:
+def test_every_point_is_named_inside_and_never_on_another_name() -> None:
+    """Of a crowd most were not."""
     rng = np.random.default_rng(3)
     crowd = [result(f"method {i:02d}", float(rng.uniform(28, 32)), float(rng.uniform(0.5, 3))) for i in range(30)]
     figure = draw(crowd)
     labels = [text for text in figure.axes[0].findobj(Text) if (text.get_gid() or "").startswith("name-")]
     boxes = [label.get_window_extent() for label in labels]
-    assert len(boxes) >= 5
+    assert len(boxes) == len(crowd)
     assert all(box.x0 >= 0 and box.x1 <= figure.bbox.width for box in boxes)
     assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
 
@@ -110,10 +113,12 @@ def test_curves_over_frames_show_the_pair_in_color() -> None:
         result("b", [28.0, 28.5, 28.0], 1),
         result("c", [20.0, 21.0, 22.0], 1),
     ]
-    drawing = chart.draw_curves(series, PSNR, ("a", "b"))
+    drawing = chart.draw_curves(series, PSNR, ("a", "b"), (1008, 1010, 1012))
     assert drawing is not None
+    for number in (1008, 1010, 1012):
+        assert f">{number}</text>" in drawing
     assert [drawing.count(color) > 0 for color in chart.COLORS[:3]] == [True, True, False]
-    assert chart.draw_curves([result("a", [30.0, 31.0], 1)], PSNR, None) is None  # too few frames for a curve
+    assert chart.draw_curves([result("a", [30.0, 31.0], 1)], PSNR, None, (1, 2)) is None  # too few frames for a curve
 
 
 def test_the_legend_has_every_family_and_as_many_rows_as_it_takes() -> None:

@@ -24,7 +24,7 @@ from tests.exr_files import write_layers
 from tests.scenes import Scene, only
 
 SCENE = Scene(frames=3, height=32, width=40)
-NEEDS = {"OIDN": "pyoidn", "network": "torch", "tKPCN": "torch"}
+NEEDS = {"OIDN": "pyoidn", "Networks": "torch"}
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def shot(tmp_path_factory: pytest.TempPathFactory) -> Shot:
 @pytest.mark.parametrize("name", [name for name in METHODS if name != "noisy"])
 def test_every_method_gives_frames_nearer_to_the_truth(shot: Shot, name: str) -> None:
     for word, package in NEEDS.items():
-        if word in name and find_spec(package) is None:
+        if word in (METHODS[name].family, *name.split()) and find_spec(package) is None:
             pytest.skip(f"{package} is not installed")
     number, image = next(METHODS[name].run(shot))
     noisy, truth = shot.read(number).color, SCENE.clean(number - SCENE.first)["ViewLayer.Combined"]

@@ -17,7 +17,7 @@ for _package in ("jinja2", "matplotlib"):
 
 from hybrid.comparison.embedding import MethodImages, ShotImages
 from hybrid.comparison.report import Report, check_report, write_report
-from hybrid.comparison.results import Comparison, read_comparison
+from hybrid.comparison.results import COSTS, Comparison, Cost, read_comparison
 from tests.hybrid.comparison.outcomes import RESULTS, SWEPT, result
 
 
@@ -54,6 +54,14 @@ def test_the_page_shows_stages_sweeps_and_other_shots(tmp_path: Path) -> None:
     alone = write_report(tmp_path, Report(Comparison("Hall", RESULTS))).read_text(encoding="utf-8")
     assert "Effect of each stage" not in alone
     assert "All shots" not in alone
+
+
+@pytest.mark.parametrize(("cost", "figure"), [("seconds_per_megapixel", "4"), ("cpu_seconds_per_megapixel", "7")])
+def test_the_head_of_the_page_has_the_time_that_was_asked_for(tmp_path: Path, cost: Cost, figure: str) -> None:
+    results = (RESULTS[0], result("final", 34.0, 4.0, cpu_seconds_per_megapixel=7.0))
+    text = write_report(tmp_path, Report(Comparison("Hall", results), cost=cost)).read_text(encoding="utf-8")
+    head = text.partition("</header>")[0]
+    assert f"<dt>{COSTS[cost]}</dt><dd>{figure}<small>" in head
 
 
 def test_page_and_picture_show_a_ladder(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from hybrid.comparison.results import (
     best_and_ties,
     join,
     leading_pair,
+    opening_pair,
     pareto_front,
     read_comparison,
     stage_values,
@@ -159,3 +160,12 @@ def test_the_strongest_rival_is_of_the_other_side() -> None:
     assert leading_pair([noisy, ours[1]], PSNR) == ("quality", "noisy")
     assert leading_pair([ours[1]], PSNR) is None
     assert leading_pair([], PSNR) is None
+
+
+def test_a_page_opens_with_the_noisy_frames_beside_our_best_method() -> None:
+    ours = [result("fast", 30, 1), result("quality", 33, 4), result("quality 3", 36, 4, sweep="Window")]
+    noisy, theirs = result("noisy", 20, 0, family="Input"), result("OIDN", 35, 1, family="OIDN")
+    assert opening_pair([noisy, theirs, *ours], PSNR) == ("noisy", "quality")
+    assert opening_pair([noisy, theirs], PSNR) == ("noisy", "OIDN")
+    assert opening_pair([theirs, *ours], PSNR) is None
+    assert opening_pair([noisy], PSNR) is None
