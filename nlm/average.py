@@ -11,13 +11,15 @@ _FAR_ABOVE = np.float32(16)
 # How far beyond the limit two or four pixels together are no highlight either. The non-local means would smear them:
 # a 2×2 cluster of 1e6 left 1000 times the light three pixels away.
 _SPARK = np.float32(100)
+# Rows that are squared at a time, which stay in the caches.
+_STRIP = 32
 
 
 def average(window: Floats, weight: Floats) -> Floats:
     """Average an aligned window (T, H, W, C) by weight; the centre's value (H, W, C) where all weights are 0."""
     window, weight = check_window(window, weight)
     out = np.empty(window.shape[1:], np.float32)
-    run_bands(_average, len(out), window, weight, out)
+    run_bands(_average, len(out), window, weight, False, out)
     return out
 
 
@@ -35,7 +37,7 @@ def robust_average(window: Floats, weight: Floats) -> Floats:
     """
     window, weight = check_window(window, weight)
     out = np.empty(window.shape[1:], np.float32)
-    run_bands(_robust_average, len(out), window, weight, out)
+    run_bands(_average, len(out), window, weight, True, out)
     return out
 
 
@@ -60,16 +62,27 @@ def reject_outliers(window: Floats, weight: Floats) -> tuple[Floats, Mask]:
     than 0.1 %; with fireflies by 0.3 to 1.2 %; by 2 % (the centre by 6 %) where two samples in three are 0.
     """
     window, weight = check_window(window, weight)
-    cleaned, mask, level = window.copy(), np.zeros(weight.shape, np.bool_), np.empty(weight.shape, np.float32)
-    run_bands(_channel_mean, window.shape[1], window, level)
+    cleaned, mask = window.copy(), np.zeros(weight.shape, np.bool_)
+    level = channel_mean(window.reshape(-1, *window.shape[2:])).reshape(weight.shape)
     run_bands(_reject_outliers, window.shape[1], window, weight, level, cleaned, mask)
     return cleaned, mask
 
 
 def channel_mean(image: Floats) -> Floats:
     """Mean (H, W) over the channels of an image (H, W, C)."""
+    channels = image.shape[2]
+    if not image.size:  # which OpenCV refuses
+        return np.empty(image.shape[:2], np.float32)
+    total = cv2.transform(np.ascontiguousarray(image, np.float32), np.ones((1, channels), np.float32))
+    return np.divide(total, np.float32(channels), out=total)
+
+
+def mean_square(image: Floats) -> Floats:
+    """Mean (H, W) over the channels of the square of an image (H, W, C)."""
     mean = np.empty(image.shape[:2], np.float32)
-    run_bands(_channel_mean, len(mean), np.ascontiguousarray(image, np.float32)[None], mean[None])
+    for top in range(0, len(image), _STRIP):
+        strip = image[top : top + _STRIP]
+        mean[top : top + _STRIP] = channel_mean(strip * strip)
     return mean
 
 
@@ -133,23 +146,7 @@ def check_exposure(exposure: float) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _average(first: int, last: int, window: Floats, weight: Floats, out: Floats) -> None:
-    T, _, W, C = window.shape
-    for y in range(first, last):
-        for x in range(W):
-            total = np.float32(0)
-            for t in range(T):
-                total += weight[t, y, x]
-            for c in range(C):
-                value = np.float32(0)
-                for t in range(T):
-                    if weight[t, y, x] > 0:  # a NaN of weight 0 must not count
-                        value += weight[t, y, x] * window[t, y, x, c]
-                out[y, x, c] = value / total if total > 0 else window[T // 2, y, x, c]
-
-
-@njit(cache=True, nogil=True)
-def _robust_average(first: int, last: int, window: Floats, weight: Floats, out: Floats) -> None:
+def _average(first: int, last: int, window: Floats, weight: Floats, robust: bool, out: Floats) -> None:
     T, _, W, C = window.shape
     for y in range(first, last):
         for x in range(W):
@@ -160,12 +157,12 @@ def _robust_average(first: int, last: int, window: Floats, weight: Floats, out: 
                 most = max(most, w)
                 trusted += w > 0
             share = np.float32(0)
-            if trusted >= 3:
+            if robust and trusted >= 3:
                 share = min(max(total / most - np.float32(2), np.float32(0)), np.float32(1))
             for c in range(C):
                 low, high = np.float32(np.inf), np.float32(-np.inf)
-                lowest, brightest = 0, 0
-                for t in range(T):
+                lowest, brightest = -1, -1
+                for t in range(T if share > 0 else 0):
                     if weight[t, y, x] > 0:
                         v = window[t, y, x, c]
                         if v < low:
@@ -177,22 +174,10 @@ def _robust_average(first: int, last: int, window: Floats, weight: Floats, out: 
                     w = weight[t, y, x]
                     if t in (lowest, brightest):  # left out, not subtracted: 1e6 would leave its rounding
                         w *= 1 - share
-                    if w > 0:
+                    if w > 0:  # a NaN of weight 0 must not count
                         value += w * window[t, y, x, c]
                         left += w
                 out[y, x, c] = value / left if left > 0 else window[T // 2, y, x, c]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _channel_mean(first: int, last: int, window: Floats, level: Floats) -> None:
-    T, _, W, C = window.shape
-    for y in range(first, last):
-        for t in range(T):
-            for x in range(W):
-                total = np.float32(0)
-                for c in range(C):
-                    total += window[t, y, x, c]
-                level[t, y, x] = total / C
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

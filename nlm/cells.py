@@ -2,8 +2,8 @@
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
-from numba import njit
 
 from loops.parallel import Floats, Places
 
@@ -26,19 +26,16 @@ def cell_axis(length: int, side: int) -> Axis:
     return Axis(pixels, before, np.minimum(before + 1, cells - 1), (position - before).astype(np.float32))
 
 
-@njit(cache=True, nogil=True, inline="always")
-def blend_rows(cells: Floats, axis: Axis, y: int, blended: Floats) -> None:
-    """Write the values of cells (K, rows, columns) at the height of a row `y` of pixels into `blended` (K, columns)."""
-    above, below, share = axis.before[y], axis.after[y], axis.share[y]
-    for k in range(cells.shape[0]):
-        for column in range(cells.shape[2]):
-            first = cells[k, above, column]
-            blended[k, column] = first + share * (cells[k, below, column] - first)
+def cell_means(plane: Floats, rows: Axis, columns: Axis) -> Floats:
+    """Means of a plane (H, W) over cells."""
+    size = columns.after[-1] + 1, rows.after[-1] + 1
+    if plane.shape != (len(rows.pixels), len(columns.pixels)):
+        plane = plane[rows.pixels[:, None], columns.pixels]
+    return np.asarray(cv2.resize(plane, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
-@njit(cache=True, nogil=True, inline="always")
-def blend_columns(blended: Floats, k: int, axis: Axis, x: int) -> np.float32:
-    """Value of plane `k` at a pixel `x` of the columns' axis, from `blend_rows`."""
-    first = blended[k, axis.before[x]]
-    value: np.float32 = first + axis.share[x] * (blended[k, axis.after[x]] - first)
-    return value
+def between_cells(cells: Floats, rows: Axis, columns: Axis) -> Floats:
+    """Values of cells (rows, columns) at all pixels: (H, W)."""
+    size = len(columns.pixels), len(rows.pixels)
+    whole = cv2.resize(cells, size, interpolation=cv2.INTER_LINEAR)
+    return np.asarray(whole[: len(rows.share), : len(columns.share)], np.float32)

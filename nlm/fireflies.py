@@ -36,6 +36,8 @@ STRANGER_WINDOW, STRANGERS = 17, 3
 # Patterns are averaged over frames where the highlight is within so many pixels of the same place in its pixel: farther
 # away the light spreads over other pixels.
 SAME_PHASE = 0.25
+# Places whose surroundings are looked at together: those of all at once would take gigabytes.
+_TOGETHER = 1024
 
 
 @dataclass(frozen=True)
@@ -120,9 +122,18 @@ def without_strangers(lights: Highlights, color: Floats, pixels: Places, other: 
 
     At most 3 of 17×17 pixels are above a quarter of the brightest where the frame has none above an eighth beside.
     """
-    count = np.zeros(len(pixels), np.intp)
-    run_bands(_count_strangers, len(count), lights.pixels, color, pixels, other, STRANGER_WINDOW // 2, count)
-    return np.asarray(count <= STRANGERS)
+    counts = [np.zeros(0, np.intp)]
+    for first in range(0, len(pixels), _TOGETHER):
+        some = slice(first, first + _TOGETHER)
+        # A pixel more on each side, for the brightest of 3×3 pixels.
+        own, around = (_levels(color, lights.pixels[some], side) for side in (3, STRANGER_WINDOW + 2))
+        near = np.maximum(np.maximum(around[:, :-2], around[:, 1:-1]), around[:, 2:])
+        near = np.maximum(np.maximum(near[..., :-2], near[..., 1:-1]), near[..., 2:])
+        bright = _levels(other, pixels[some], STRANGER_WINDOW)
+        peak = own.max(axis=(1, 2), keepdims=True)
+        inside = np.isfinite(around[:, 1:-1, 1:-1])
+        counts.append(np.count_nonzero(inside & (bright > peak / 4) & (near < peak / 8), axis=(1, 2)))
+    return np.asarray(np.concatenate(counts) <= STRANGERS)
 
 
 def recurs_nearby(places: Places, color: Floats, pixels: Places, other: Floats) -> Mask:
@@ -130,8 +141,12 @@ def recurs_nearby(places: Places, color: Floats, pixels: Places, other: Floats) 
     pixels.
     """
     rows, columns, inside = (block[:, 0, 0] for block in _blocks(pixels, color.shape, 1))
-    near = np.empty(len(places), np.float32)
-    run_bands(_brightest_around, len(near), other, rows, columns, SPREAD // 2, near)
+    nearby = [np.zeros(0, np.float32)]
+    for first in range(0, len(places), _TOGETHER):
+        some = slice(first, first + _TOGETHER)
+        around = _levels(other, np.stack([rows[some], columns[some]], axis=-1), SPREAD)
+        nearby.append(around.max(axis=(1, 2)))
+    near = np.concatenate(nearby)
     return np.asarray(inside & (near >= RECURS * channel_mean(color[places[:, 0], places[:, 1]][None])[0]))
 
 
@@ -249,53 +264,11 @@ def _same_phase(moved: Points) -> Mask:
     return np.asarray(np.abs(moved - nearest_pixel(moved)).max(axis=1) <= SAME_PHASE)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _level(color: Floats, y: int, x: int) -> np.float32:
-    """Mean over channels of a pixel, as `nlm.average.channel_mean`."""
-    total = np.float32(0)
-    for c in range(color.shape[2]):
-        total += color[y, x, c]
-    return np.float32(total / color.shape[2])
-
-
-@njit(cache=True, nogil=True)
-def _brightest_around(
-    first: int, last: int, color: Floats, rows: Places, columns: Places, reach: int, brightest: Floats
-) -> None:
-    """Write the brightest of the pixels within `reach` of each place."""
-    height, width = color.shape[:2]
-    for k in range(first, last):
-        most = np.float32(-np.inf)
-        for y in range(max(rows[k] - reach, 0), min(rows[k] + reach + 1, height)):
-            for x in range(max(columns[k] - reach, 0), min(columns[k] + reach + 1, width)):
-                most = max(most, _level(color, y, x))
-        brightest[k] = most
-
-
-@njit(cache=True, nogil=True)
-def _count_strangers(
-    first: int, last: int, middles: Places, color: Floats, pixels: Places, other: Floats, reach: int, count: Places
-) -> None:
-    """Count the bright pixels around each place of another frame that the frame lacks within a pixel's distance."""
-    height, width = color.shape[:2]
-    for k in range(first, last):
-        peak = np.float32(-np.inf)
-        for y in range(max(middles[k, 0] - 1, 0), min(middles[k, 0] + 2, height)):
-            for x in range(max(middles[k, 1] - 1, 0), min(middles[k, 1] + 2, width)):
-                peak = max(peak, _level(color, y, x))
-        for j in range(-reach, reach + 1):
-            for i in range(-reach, reach + 1):
-                here_y, here_x, y, x = middles[k, 0] + j, middles[k, 1] + i, pixels[k, 0] + j, pixels[k, 1] + i
-                inside = 0 <= here_y < height and 0 <= here_x < width
-                if not (inside and 0 <= y < height and 0 <= x < width):
-                    continue
-                if not _level(other, y, x) > peak / np.float32(4):
-                    continue
-                most = np.float32(-np.inf)
-                for near_y in range(max(here_y - 1, 0), min(here_y + 2, height)):
-                    for near_x in range(max(here_x - 1, 0), min(here_x + 2, width)):
-                        most = max(most, _level(color, near_y, near_x))
-                count[k] += most < peak / np.float32(8)
+def _levels(color: Floats, pixels: Places, side: int) -> Floats:
+    """Mean over channels of `side`² pixels around each pixel, (K, side, side); −∞ outside the frame."""
+    rows, columns, inside = _blocks(pixels, color.shape, side)
+    level = channel_mean(color[rows, columns].reshape(len(pixels), -1, color.shape[2])).reshape(inside.shape)
+    return np.where(inside, level, np.float32(-np.inf))
 
 
 @njit(cache=True, nogil=True)

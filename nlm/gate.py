@@ -8,7 +8,7 @@ from numba import njit
 
 from loops.decay import decay
 from loops.parallel import Floats, Mask, run_bands
-from nlm.average import check_colors, check_exposure, check_window
+from nlm.average import check_colors, check_exposure, check_window, mean_square
 
 _MEAN_SIZE = (9, 9)
 _NOISE_SIZE = (15, 15)
@@ -83,7 +83,7 @@ def color_gates(
     both = np.empty(shape[:2], np.bool_)
     run_bands(_compare, shape[0], noisy, centre, np.float32(exposure), difference, both)
     # The running sums of a box filter round to a little below 0 where nothing differs.
-    noise = np.sqrt(np.maximum(cv2.blur(_mean_square(difference), _NOISE_SIZE), 0))
+    noise = np.sqrt(np.maximum(cv2.blur(mean_square(difference), _NOISE_SIZE), 0))
     rates = [1 / np.square(np.float32(share) * noise + np.float32(floor)) for share in shares]
     weights = [np.empty(estimates.shape[:3], np.float32) for _ in shares]
     for t, estimate in enumerate(estimates):
@@ -92,10 +92,10 @@ def color_gates(
                 weight[t] = 1
             continue
         run_bands(_compare, shape[0], estimate, centre, np.float32(exposure), difference, both)
-        mean = _mean_square(np.asarray(cv2.blur(difference, _MEAN_SIZE), np.float32))
+        mean = mean_square(np.asarray(cv2.blur(difference, _MEAN_SIZE), np.float32))
         around = cv2.blur(mean, _AROUND_SIZE)
         if detail is not None:
-            energy = cv2.blur(_mean_square(difference), _DETAIL_SIZE)
+            energy = cv2.blur(mean_square(difference), _DETAIL_SIZE)
             around = np.maximum(around, energy / np.float32(detail**2))
         for rate, weight in zip(rates, weights, strict=True):
             run_bands(_weigh, shape[0], mean, around, rate, both, weight[t])
@@ -143,11 +143,13 @@ def agreement_weight(estimates: Floats, noisy: Floats, confidence: Floats, expos
     noisy = np.ascontiguousarray(noisy, np.float32)
     run_bands(_compare_neighbours, len(noisy), estimates, noisy, confidence, np.float32(exposure), sums)
     spread, trust, repeat, excess, noise = sums
-    wide = (cv2.blur(plane, _SCATTER_SIZE) for plane in (spread, trust, repeat))
-    near = (cv2.blur(plane, _EXCESS_SIZE) for plane in (excess, trust))
-    weight = np.empty(noisy.shape[:2], np.float32)
-    run_bands(_weigh_neighbours, len(noisy), *wide, *near, cv2.blur(noise, _NOISE_SIZE), weight)
-    return weight
+    spread, wide, repeat = (cv2.blur(plane, _SCATTER_SIZE) for plane in (spread, trust, repeat))
+    excess, near = (cv2.blur(plane, _EXCESS_SIZE) for plane in (excess, trust))
+    with np.errstate(divide="ignore", invalid="ignore"):  # where no neighbour is trusted
+        count, variance = wide / repeat, np.maximum(spread, 0) / (wide - repeat)
+        error = excess / near - cv2.blur(noise, _NOISE_SIZE) - _SURE * variance * (1 + 1 / count)
+        known = (wide > _LEAST_COUNT * repeat) & (near > 0) & (error > 0)
+        return np.where(known, variance / (variance + count * error), np.float32(1))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -190,24 +192,6 @@ def _compare_neighbours(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _weigh_neighbours(
-    first: int, last: int, spread: Floats, wide: Floats, repeat: Floats, excess: Floats, near: Floats, noise: Floats,
-    weight: Floats,
-) -> None:  # fmt: skip
-    """Write V / (V + N a²), and 1 where N is less than `_LEAST_COUNT`."""
-    zero, one = np.float32(0), np.float32(1)
-    for y in range(first, last):
-        for x in range(spread.shape[1]):
-            weight[y, x] = one
-            if wide[y, x] > _LEAST_COUNT * repeat[y, x] and near[y, x] > zero:
-                count = wide[y, x] / repeat[y, x]
-                variance = max(spread[y, x], zero) / (wide[y, x] - repeat[y, x])
-                error = excess[y, x] / near[y, x] - noise[y, x] - _SURE * variance * (one + one / count)
-                if error > zero:
-                    weight[y, x] = variance / (variance + count * error)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def _compare(
     first: int, last: int, image: Floats, centre: Floats, exposure: np.float32, difference: Floats, both: Mask
 ) -> None:
@@ -227,23 +211,6 @@ def _compare(
             both[y, x] = finite
             if not finite:
                 difference[y, x] = 0
-
-
-def _mean_square(x: Floats) -> Floats:
-    """Mean (H, W) over channels of x²."""
-    mean = np.empty(x.shape[:2], np.float32)
-    run_bands(_square, len(x), x, mean)
-    return mean
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _square(first: int, last: int, x: Floats, mean: Floats) -> None:
-    for row in range(first, last):
-        for column in range(x.shape[1]):
-            total = np.float32(0)
-            for c in range(3):
-                total += x[row, column, c] * x[row, column, c]
-            mean[row, column] = total / np.float32(3)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

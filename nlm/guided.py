@@ -9,6 +9,8 @@ from nlm.average import replace_nonfinite
 
 # Rows filtered with the same running sums.
 _STRIP = 64
+# Rows that are measured together, which stay in the caches in float64.
+_ROWS = 8
 
 
 def guided_filter(
@@ -68,7 +70,7 @@ def guided_filter(
     strips = -(-size[0] // _STRIP)
     boxes, coefficients = (np.empty((*size, channels * planes + channels + 1), np.float32) for _ in range(2))
     run_bands(_solve, strips, small_image, small_guide, small_trust, small_radius, float(eps), boxes)
-    run_bands(_box_sum, strips, boxes, small_radius, coefficients)
+    run_bands(_sum_boxes, strips, boxes, small_radius, coefficients)
     output = np.empty(image.shape, np.float32)
     run_bands(_apply, len(output), coefficients, guide, image, subsample, output)
     box = np.ones((4 * radius + 1, 4 * radius + 1), np.uint8)
@@ -78,10 +80,13 @@ def guided_filter(
 
 def measure_guide(guide: Floats) -> Doubles:
     """Return mean and standard deviation (2, G) float64 of the channels of a finite guide (H, W, G)."""
-    pixels = guide.shape[0] * guide.shape[1]
-    rows = np.zeros((guide.shape[0], 2, guide.shape[2]))
-    run_bands(_row_moments, len(rows), np.ascontiguousarray(guide, np.float32), rows)
-    first, second = rows.sum(axis=0) / pixels
+    height, width, channels = guide.shape
+    sums = np.zeros((2, width * channels))
+    for top in range(0, height, _ROWS):
+        rows = guide[top : top + _ROWS].reshape(-1, width * channels).astype(np.float64)
+        sums[0] += rows.sum(axis=0)
+        sums[1] += np.square(rows, out=rows).sum(axis=0)
+    first, second = sums.reshape(2, width, channels).sum(axis=1) / (height * width)
     return np.stack([first, np.sqrt(np.maximum(second - first * first, 0))])
 
 
@@ -91,54 +96,34 @@ def _standardise(guide: Floats, moments: Doubles) -> Floats:
     # what is below the rounding of float32 is no structure (and float64's rounding of the variance is 1e-8)
     constant = deviation <= 1e-6 * np.abs(mean)
     scale = np.where(constant, 0.0, 1.0 / np.where(constant, 1.0, deviation))
-    out = np.empty(guide.shape, np.float32)
-    run_bands(_scale, len(out), guide, mean.astype(np.float32), scale.astype(np.float32), out)
-    return out
+    # Whole rows at a time: numpy takes long over the short axis.
+    centre, factor = (np.tile(np.float32(values), guide.shape[1]) for values in (mean, scale))
+    out = guide.reshape(len(guide), -1) - centre
+    out *= factor
+    return out.reshape(guide.shape)
 
 
 def _shrink(image: Floats, step: int) -> Floats:
     """Mean of each step × step block, cut at the lower and right edge."""
     height, width, channels = image.shape
-    out = np.zeros((-(-height // step), -(-width // step), channels), np.float32)
-    run_bands(_mean_blocks, len(out), image, step, out)
-    return out
+    below, right = -height % step, -width % step
+    # Zeros beyond the edge, by which the means are too small.
+    whole = cv2.copyMakeBorder(image, 0, below, 0, right, cv2.BORDER_CONSTANT) if below or right else image
+    size = (width + right) // step, (height + below) // step
+    means = cv2.resize(whole, size, interpolation=cv2.INTER_AREA).reshape(size[1], size[0], channels)
+    means[-1] *= step / (step - below)
+    means[:, -1] *= step / (step - right)
+    return np.asarray(means, np.float32)
 
 
-@njit(cache=True, nogil=True, boundscheck=False)
-def _row_moments(first: int, last: int, image: Floats, sums: Doubles) -> None:
-    """Sums over each row of x and of x², (H, 2, C)."""
-    _, W, C = image.shape
-    for y in range(first, last):
-        for x in range(W):
-            for c in range(C):
-                value = float(image[y, x, c])
-                sums[y, 0, c] += value
-                sums[y, 1, c] += value * value
-
-
-@njit(cache=True, nogil=True, boundscheck=False)
-def _scale(first: int, last: int, image: Floats, centre: Floats, scale: Floats, out: Floats) -> None:
-    """Write (image − centre) · scale, channel by channel."""
-    _, W, C = image.shape
-    for y in range(first, last):
-        for x in range(W):
-            for c in range(C):
-                out[y, x, c] = (image[y, x, c] - centre[c]) * scale[c]
-
-
-@njit(cache=True, nogil=True, boundscheck=False)
-def _mean_blocks(first: int, last: int, image: Floats, step: int, out: Floats) -> None:
-    H, W, C = image.shape
-    for y in range(first, last):
-        bottom = min(y * step + step, H)
-        for sy in range(y * step, bottom):
-            for x in range(W):
-                for c in range(C):
-                    out[y, x // step, c] += image[sy, x, c]
-        for x in range(out.shape[1]):
-            count = (bottom - y * step) * (min(x * step + step, W) - x * step)
-            for c in range(C):
-                out[y, x, c] /= count
+def _sum_boxes(first: int, last: int, values: Floats, radius: int, out: Floats) -> None:
+    """Sum of (H, W, M) over the box around each pixel, cut at the frame's edge, for strips of rows."""
+    for strip in range(first, last):
+        top, bottom = strip * _STRIP, min(strip * _STRIP + _STRIP, len(values))
+        above, size = max(top - radius, 0), (2 * radius + 1, 2 * radius + 1)
+        rows = values[above : bottom + radius]
+        sums = cv2.boxFilter(rows, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        out[top:bottom] = sums.reshape(rows.shape)[top - above : bottom - above]
 
 
 @njit(cache=True, nogil=True, boundscheck=False, inline="always")
@@ -234,34 +219,6 @@ def _solve(
                             box[m] += sign * columns[column, m]
                 if x >= 0:
                     _solve_box(out[y, x], box, matrix, right, G, C, eps)
-
-
-@njit(cache=True, nogil=True, boundscheck=False)
-def _box_sum(first: int, last: int, values: Floats, radius: int, out: Floats) -> None:
-    """Sum of (H, W, M) over the box around each pixel, cut at the frame's edge, for strips of rows."""
-    H, W, M = values.shape
-    for strip in range(first, last):
-        top, bottom = strip * _STRIP, min(strip * _STRIP + _STRIP, H)
-        columns, box = np.zeros((W, M)), np.empty(M)
-        for y in range(max(top - radius, 0) - radius, bottom):
-            for sign in (1.0, -1.0):
-                row = y + radius if sign > 0 else y - radius - 1
-                if max(top - radius, 0) <= row < H:
-                    for x in range(W):
-                        for m in range(M):
-                            columns[x, m] += sign * values[row, x, m]
-            if y < top:
-                continue
-            box[:] = 0
-            for x in range(-radius, W):
-                for sign in (1.0, -1.0):
-                    column = x + radius if sign > 0 else x - radius - 1
-                    if 0 <= column < W:
-                        for m in range(M):
-                            box[m] += sign * columns[column, m]
-                if x >= 0:
-                    for m in range(M):
-                        out[y, x, m] = box[m]
 
 
 @njit(cache=True, nogil=True, boundscheck=False, error_model="numpy")

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 
 from loops.parallel import Floats
+from nlm.average import mean_square
 
 # Box, pixels, over which the noise of the samples is measured, as in `nlm.gate`.
 _NOISE_SIZE = (15, 15)
@@ -22,7 +23,7 @@ def measure_noise(noisy: Floats, estimate: Floats) -> Floats:
         The 15×15 mean of (noisy − estimate)², in the mean over channels.
     """
     # The running sums of a box filter round to a little below 0.
-    return np.asarray(np.maximum(cv2.blur(_mean_square(noisy - estimate), _NOISE_SIZE), 0), np.float32)
+    return np.asarray(np.maximum(cv2.blur(mean_square(noisy - estimate), _NOISE_SIZE), 0), np.float32)
 
 
 def interpolation_weight(warped: Floats, bilinear: Floats, variance: Floats) -> Floats:
@@ -45,11 +46,7 @@ def interpolation_weight(warped: Floats, bilinear: Floats, variance: Floats) -> 
     shots of the ladder gain 0.04, 0.05 and 0.2 dB at 32, 128 and 512 (*garden* 0.2 and 0.3). Through 4 e² lamps and
     glass lose 0.1 dB more, and with differences from the centre of over three deviations of a sample 0.2 dB more.
     """
-    error = _mean_square(warped - bilinear)
+    error = mean_square(warped - bilinear)
     # Least float32: without noise, and where nothing differs, the weight is 1.
     least = np.finfo(np.float32).tiny
     return np.asarray((variance + least) / (variance + error + least), np.float32)
-
-
-def _mean_square(x: Floats) -> Floats:
-    return np.asarray(np.square(x).mean(axis=-1), np.float32)

@@ -132,209 +132,147 @@ def joint_nlm(
     return out
 
 
+def _filter(first: int, last: int, given: _Inputs, radius: int, patch: int, k: np.float32, out: Floats) -> None:
+    """Filter the tiles from `first` to `last`, which are counted along rows of tiles."""
+    height, width, _ = out.shape
+    columns, centre = -(-width // _TILE_WIDTH), given.window[len(given.window) // 2]
+    for tile in range(first, last):
+        top, left = tile // columns * BAND, tile % columns * _TILE_WIDTH
+        rows, whole = slice(top, min(top + BAND, height)), slice(left, min(left + _TILE_WIDTH, width))
+        out[rows, whole] = centre[rows, whole]
+        asked = np.flatnonzero(given.where[rows, whole].any(axis=0))
+        if asked.size:
+            part = slice(left + max(asked[0] - _PAD, 0), min(left + asked[-1] + 1 + _PAD, whole.stop))
+            _filter_tile(given, radius, patch, k, (top, part.start), out[rows, part])
+
+
+def _filter_tile(given: _Inputs, radius: int, patch: int, k: np.float32, corner: tuple[int, int], out: Floats) -> None:
+    """Average all taps of the tile at `corner`."""
+    (height, width, channels), margin, middle = out.shape, radius + patch, len(given.window) // 2
+    (top, left), size = (place - margin for place in corner), (height + 2 * margin, width + 2 * margin)
+    variance = _load(given.variance, (top, left), size) * (k * k)
+    padded = _load(given.features, (top, left), size)
+    frames = [
+        _load_frame(*both, variance, padded, (top, left)) for both in zip(given.window, given.confidence, strict=True)
+    ]
+    features, scale = _load_features(given.features, corner, (height, width))
+    centre = frames[middle]._replace(features=features)
+    total, weight = np.zeros((channels, height, width), np.float32), np.zeros((height, width), np.float32)
+    for frame in frames:
+        _add_frame(centre, frame, scale, radius, patch, k, total, weight)
+    np.divide(total, weight, out=total, where=weight > 0)
+    total += centre.values[:, margin : margin + height, margin : margin + width]
+    out[...] = total.transpose(1, 2, 0)
+
+
+def _load(source: Floats, corner: tuple[int, int], size: tuple[int, int]) -> Floats:
+    """Copy a tile of (H, W, C) into planes (C, h, w), with the edge repeated beyond the frame."""
+    (top, left), (h, w), (height, width, _) = corner, size, source.shape
+    rows, columns = slice(max(top, 0), min(top + h, height)), slice(max(left, 0), min(left + w, width))
+    above, below, before, after = rows.start - top, rows.stop - top, columns.start - left, columns.stop - left
+    planes = np.empty((source.shape[2], h, w), np.float32)
+    for c, plane in enumerate(planes):
+        plane[above:below, before:after] = source[rows, columns, c]
+    planes[:, :above], planes[:, below:] = planes[:, above : above + 1], planes[:, below - 1 : below]
+    planes[..., :before], planes[..., after:] = planes[..., before : before + 1], planes[..., after - 1 : after]
+    return planes
+
+
+def _load_frame(
+    frame: Floats, confidence: Floats, variance: Floats, features: Floats, corner: tuple[int, int]
+) -> _Tile:
+    """Load values, their noise term of a `variance` (C, h, w) and the weight of each tap, 0 outside the frame."""
+    size, (top, left), (height, width) = variance.shape[1:], corner, confidence.shape
+    values, trust = _load(frame, corner, size), np.zeros(size, np.float32)
+    rows, columns = slice(max(top, 0), min(top + size[0], height)), slice(max(left, 0), min(left + size[1], width))
+    trust[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = confidence[rows, columns]
+    known = np.abs(values) < np.float32(_HUGE)
+    if not known.all():
+        values[~known] = 0
+        trust[~known.all(axis=0)] = 0
+    noise = np.fmax(variance + np.float32(_RELATIVE_VARIANCE) * values * values, np.float32(_TINY))
+    return _Tile(values, noise, features, trust)
+
+
+def _load_features(features: Floats, corner: tuple[int, int], size: tuple[int, int]) -> tuple[Floats, Floats]:
+    """Load the centre's features, and the factor from squared difference to distance."""
+    around = _load(features, (corner[0] - 1, corner[1] - 1), (size[0] + 2, size[1] + 2))
+    across, down = around[:, 1:-1, 2:] - around[:, 1:-1, :-2], around[:, 2:, 1:-1] - around[:, :-2, 1:-1]
+    tolerance = np.maximum(np.float32(0.25) * (across * across + down * down), np.float32(_FEATURE_FLOOR))
+    return np.ascontiguousarray(around[:, 1:-1, 1:-1]), np.reciprocal(tolerance)
+
+
 # Rows are read from flat planes at an offset: a view of a row takes as long as ten of its pixels. Offsets are unsigned:
 # with a signed index numba tests each time whether it counts from the end.
 @njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _add_color_distance(
-    d: Floats, far: Floats, pu: Floats, pa: Floats, p: np.uintp, qu: Floats, qa: Floats, q: np.uintp,
-    cancel: np.float32, limit: np.float32,
-) -> None:  # fmt: skip
-    """Add the distances of one channel from p to q; those of values too far apart are marked in `far`."""
-    for x in range(np.uintp(d.size)):
-        diff = pu[p + x] - qu[q + x]
-        a, b = pa[p + x], qa[q + x]
-        low = a if a < b else b
-        v = (diff * diff - cancel * (a + low)) / (a + b)
-        d[x] += v if v < np.float32(_PIXEL_CAP) else np.float32(_PIXEL_CAP)
-        far[x] = np.float32(_NEVER) if diff * diff > limit * (a + b) else far[x]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _max_feature_distance(d: Floats, pf: Floats, qf: Floats, scale: Floats) -> None:
-    for x in range(d.size):
-        diff = pf[x] - qf[x]
-        v = diff * diff * scale[x]
-        d[x] = v if v > d[x] else d[x]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _accumulate(
-    total: Floats, out: np.uintp, w: Floats, values: Floats, q: np.uintp, centre: Floats, p: np.uintp
+def _add_frame(
+    centre: _Tile, frame: _Tile, scale: Floats, radius: int, patch: int, k: np.float32, total: Floats, weight: Floats
 ) -> None:
-    # The difference from the centre: hundreds of roundings of a sum would shift even a constant picture.
-    for x in range(np.uintp(w.size)):
-        total[out + x] += w[x] * (values[q + x] - centre[p + x])
-
-
-@njit(cache=True, nogil=True, boundscheck=False)
-def _load(target: Floats, source: Floats, top: int, left: int) -> None:
-    """Copy a tile of (H, W, C) into planes (C, h, w), with the edge repeated beyond the frame."""
-    planes, h, w = target.shape
-    height, width = source.shape[:2]
-    first, last = max(-left, 0), min(width - left, w)
-    for y in range(h):
-        row = source[min(max(top + y, 0), height - 1)]
-        for c in range(planes):
-            line = target[c, y]
-            for x in range(first):
-                line[x] = row[0, c]
-            for x in range(first, last):
-                line[x] = row[left + x, c]
-            for x in range(last, w):
-                line[x] = row[width - 1, c]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _load_frame(tile: _Tile, variance: Floats, frame: Floats, confidence: Floats, top: int, left: int) -> None:
-    """Load values, their noise term of a `variance` (C, h, w) and the weight of each tap, 0 outside the frame."""
-    channels, h, w = tile.values.shape
-    height, width = confidence.shape
-    huge, share, least = np.float32(_HUGE), np.float32(_RELATIVE_VARIANCE), np.float32(_TINY)
-    _load(tile.values, frame, top, left)
-    tile.trust[:] = 0
-    for y in range(max(-top, 0), min(height - top, h)):
-        for x in range(max(-left, 0), min(width - left, w)):
-            tile.trust[y, x] = confidence[top + y, left + x]
-    for c in range(channels):
-        for y in range(h):
-            values, noise, trust, own = tile.values[c, y], tile.noise[c, y], tile.trust[y], variance[c, y]
-            for x in range(w):
-                known = abs(values[x]) < huge
-                values[x] = values[x] if known else np.float32(0)
-                trust[x] = trust[x] if known else np.float32(0)
-                term = own[x] + share * values[x] * values[x]
-                noise[x] = term if term > least else least
-
-
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _load_features(f: Floats, scale: Floats, features: Floats, top: int, left: int) -> None:
-    """Load the centre's features `f`, and the factor from squared difference to distance."""
-    planes, h, w = f.shape
-    height, width = features.shape[:2]
-    _load(f, features, top, left)
-    for y in range(h):
-        up, down = features[max(top + y - 1, 0)], features[min(top + y + 1, height - 1)]
-        here = features[top + y]
-        for x in range(w):
-            sx = left + x
-            before, after = max(sx - 1, 0), min(sx + 1, width - 1)
-            for c in range(planes):
-                gx, gy = here[after, c] - here[before, c], down[sx, c] - up[sx, c]
-                tolerance = max(np.float32(0.25) * (gx * gx + gy * gy), np.float32(_FEATURE_FLOOR))
-                scale[c, y, x] = 1 / tolerance
-
-
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _weigh(
-    weight: Floats, column: Floats, least: Floats, trust: Floats, q: np.uintp, patch: int, norm: np.float32
-) -> None:
-    """Write the weights of a row of taps: patch distance from the column sums, at least `least`."""
-    size = np.uintp(weight.size)
-    weight[:] = 0
-    for n in range(np.uintp(2 * patch + 1)):
-        for x in range(size):
-            weight[x] += column[n + x]
-    for x in range(size):
-        d = weight[x] * norm
-        d = d if d > least[x] else least[x]
-        # (1 - d/16)^16 is e^-d to the precision needed, and vectorises
-        e = np.float32(1) - d * np.float32(1 / _NEVER)
-        e = e if e > np.float32(0) else np.float32(0)
-        e *= e
-        e *= e
-        e *= e
-        weight[x] = e * e * trust[q + x]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-def _filter(first: int, last: int, given: _Inputs, radius: int, patch: int, k: np.float32, out: Floats) -> None:
-    """Filter the tiles from `first` to `last`, which are counted along rows of tiles."""
-    H, W, channels = out.shape
-    columns, centre = -(-W // _TILE_WIDTH), given.window[len(given.window) // 2]
-    for tile in range(first, last):
-        top, left = tile // columns * BAND, tile % columns * _TILE_WIDTH
-        bottom, right = min(top + BAND, H), min(left + _TILE_WIDTH, W)
-        begin, end = right, left
-        for y in range(top, bottom):
-            for x in range(left, right):
-                for c in range(channels):
-                    out[y, x, c] = centre[y, x, c]
-                if given.where[y, x]:
-                    begin, end = min(begin, x), max(end, x + 1)
-        if begin < end:
-            begin, end = max(begin - _PAD, left), min(end + _PAD, right)
-            _filter_tile(given, radius, patch, k, (top, begin), out[top:bottom, begin:end])
-
-
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False, inline="always")
-def _filter_tile(given: _Inputs, radius: int, patch: int, k: np.float32, corner: tuple[int, int], out: Floats) -> None:
-    """Average all taps of the tile at `corner`."""
-    T, F, (th, tw, C), margin = len(given.window), given.features.shape[2], out.shape, radius + patch
-    h, w, top, left = th + 2 * margin, tw + 2 * margin, corner[0] - margin, corner[1] - margin
-    trust = np.empty((h, w), np.float32)
-    features, scale = np.empty((F, th, tw), np.float32), np.empty((F, th, tw), np.float32)
-    centre = _Tile(np.empty((C, h, w), np.float32), np.empty((C, h, w), np.float32), features, trust)
-    padded = np.empty((F, h, w), np.float32)
-    frame = _Tile(np.empty((C, h, w), np.float32), np.empty((C, h, w), np.float32), padded, trust)
-    total, weight = np.zeros((C, th, tw), np.float32), np.zeros((th, tw), np.float32)
-    variance = np.empty((C, h, w), np.float32)
-    _load(variance, given.variance, top, left)
-    variance *= k * k
-    _load_frame(centre, variance, given.window[T // 2], given.confidence[T // 2], top, left)
-    _load_features(features, scale, given.features, corner[0], corner[1])
-    _load(padded, given.features, top, left)
-    for t in range(T):
-        _load_frame(frame, variance, given.window[t], given.confidence[t], top, left)
-        for dy in range(-radius, radius + 1):
-            for dx in range(-radius, radius + 1):
-                _add_taps(centre, frame, scale, patch, (dy, dx), k, total, weight)
-    for y in range(th):
-        for x in range(tw):
-            for c in range(C):
-                mean = total[c, y, x] / weight[y, x] if weight[y, x] > 0 else np.float32(0)
-                out[y, x, c] = centre.values[c, y + margin, x + margin] + mean
-
-
-@njit(cache=True, nogil=True, error_model="numpy", boundscheck=False, inline="always")
-def _add_taps(
-    centre: _Tile, frame: _Tile, scale: Floats, patch: int, step: tuple[int, int], k: np.float32, total: Floats,
-    weight: Floats,
-) -> None:  # fmt: skip
-    """Add the taps of one frame at the offset `step` to all pixels of a tile."""
+    """Add the taps of one frame to all pixels of a tile."""
     C, th, tw = total.shape
     h, w = frame.trust.shape
-    margin, size = (h - th) // 2, 2 * patch + 1
-    cancel, far, norm = np.float32(1 / (k * k)), np.float32(_FAR / (k * k)), np.float32(1 / (C * size**2))
-    ring, column = np.zeros((size, tw + 2 * patch), np.float32), np.zeros(tw + 2 * patch, np.float32)
-    beyond, tap = np.empty((size, tw + 2 * patch), np.float32), np.empty(tw, np.float32)
+    margin, size = radius + patch, 2 * patch + 1
+    cancel, limit, norm = np.float32(1 / (k * k)), np.float32(_FAR / (k * k)), np.float32(1 / (C * size**2))
+    zero, one, cap, never = np.float32(0), np.float32(1), np.float32(_PIXEL_CAP), np.float32(_NEVER)
+    wide = np.uintp(tw + 2 * patch)
+    ring, beyond = np.empty((size, wide), np.float32), np.empty((size, wide), np.float32)
+    column, tap = np.empty(wide, np.float32), np.empty(tw, np.float32)
     own, own_noise = centre.values.reshape(-1), centre.noise.reshape(-1)
     other, other_noise, trust = frame.values.reshape(-1), frame.noise.reshape(-1), frame.trust.reshape(-1)
     sums, weights = total.reshape(-1), weight.reshape(-1)
-    shift = step[0] * w + step[1]
-    for y in range(-patch, th + patch):
-        # The running sums over the columns of patches, with one row of distances replaced.
-        row, distance = ring[(y + patch) % size], beyond[(y + patch) % size]
-        for x in range(np.uintp(row.size)):
-            column[x] -= row[x]
-            row[x] = distance[x] = 0
-        for c in range(C):
-            p = (c * h + y + margin) * w + margin - patch
-            q = np.uintp(p + shift)
-            _add_color_distance(row, distance, own, own_noise, np.uintp(p), other, other_noise, q, cancel, far)
-        for x in range(np.uintp(row.size)):
-            column[x] += row[x]
-        oy = y - patch
-        if oy < 0:
-            continue
-        distance = beyond[(oy + patch) % size, patch : patch + tw]
-        qy, left = oy + margin + step[0], margin + step[1]
-        for f in range(len(scale)):
-            there = frame.features[f, qy, left : left + tw]
-            _max_feature_distance(distance, centre.features[f, oy], there, scale[f, oy])
-        p, out = (oy + margin) * w + margin, oy * tw
-        _weigh(tap, column, distance, trust, np.uintp(p + shift), patch, norm)
-        for x in range(np.uintp(tw)):
-            weights[np.uintp(out) + x] += tap[x]
-        for c in range(C):
-            q = np.uintp(p + shift + c * h * w)
-            _accumulate(sums, np.uintp(out + c * th * tw), tap, other, q, own, np.uintp(p + c * h * w))
+    for step in range((2 * radius + 1) ** 2):
+        dy, dx = step // (2 * radius + 1) - radius, step % (2 * radius + 1) - radius
+        shift = dy * w + dx
+        ring[:], column[:] = zero, zero
+        for y in range(-patch, th + patch):
+            # The running sums over the columns of patches, with one row of distances replaced.
+            row, distance = ring[(y + patch) % size], beyond[(y + patch) % size]
+            for x in range(wide):
+                column[x] -= row[x]
+                row[x] = distance[x] = zero
+            for c in range(C):
+                p = np.uintp((c * h + y + margin) * w + radius)
+                q = np.uintp(np.intp(p) + shift)
+                for x in range(wide):
+                    diff = own[p + x] - other[q + x]
+                    a, b = own_noise[p + x], other_noise[q + x]
+                    v = (diff * diff - cancel * (a + (a if a < b else b))) / (a + b)
+                    row[x] += v if v < cap else cap
+                    # A value too far from the centre's.
+                    distance[x] = never if diff * diff > limit * (a + b) else distance[x]
+            for x in range(wide):
+                column[x] += row[x]
+            oy = y - patch
+            if oy < 0:
+                continue
+            least = beyond[(oy + patch) % size, patch : patch + tw]
+            qy, left = oy + margin + dy, margin + dx
+            for f in range(len(scale)):
+                guide, guided, rate = centre.features[f, oy], frame.features[f, qy, left : left + tw], scale[f, oy]
+                for x in range(tw):
+                    diff = guide[x] - guided[x]
+                    v = diff * diff * rate[x]
+                    least[x] = v if v > least[x] else least[x]
+            p = np.uintp((oy + margin) * w + margin)
+            q, out = np.uintp(np.intp(p) + shift), np.uintp(oy * tw)
+            tap[:] = zero
+            for n in range(np.uintp(size)):
+                for x in range(np.uintp(tw)):
+                    tap[x] += column[n + x]
+            for x in range(np.uintp(tw)):
+                d = tap[x] * norm
+                d = d if d > least[x] else least[x]
+                # (1 - d/16)^16 is e^-d to the precision needed, and vectorises
+                e = one - d * np.float32(1 / _NEVER)
+                e = e if e > zero else zero
+                e *= e
+                e *= e
+                e *= e
+                tap[x] = e * e * trust[q + x]
+            for x in range(np.uintp(tw)):
+                weights[out + x] += tap[x]
+            for c in range(C):
+                here, there, into = p + np.uintp(c * h * w), q + np.uintp(c * h * w), out + np.uintp(c * th * tw)
+                # The difference from the centre: hundreds of roundings of a sum would shift even a constant picture.
+                for x in range(np.uintp(tw)):
+                    sums[into + x] += tap[x] * (other[there + x] - own[here + x])

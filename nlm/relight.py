@@ -53,17 +53,13 @@ def relight(window: Floats, alike: Floats, trusted: Floats, exposure: float, *, 
         run_bands(_subtract, height, *pair, alike[t], change[offset : offset + height, :width])
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _light(there: np.float32, here: np.float32, exposure: np.float32) -> np.float32:
-    return np.float32(0.5) * (max(there, np.float32(0)) + max(here, np.float32(0))) + exposure
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sum_cells(
     first: int, last: int, there: Floats, here: Floats, trusted: Floats, exposure: np.float32, offset: int, sums: Floats
 ) -> None:
     """Sum over cells the relative difference of each channel, weighted by confidence, and the confidence."""
     H, W, C = there.shape
+    half, zero = np.float32(0.5), np.float32(0)
     for row in range(first, last):
         for y in range(max(row * _CELL - offset, 0), min((row + 1) * _CELL - offset, H)):
             for x in range(W):
@@ -72,7 +68,8 @@ def _sum_cells(
                     continue
                 for c in range(C):
                     centre, other = here[y, x, c], there[y, x, c]
-                    sums[c, row, x // _CELL] += weight * ((other - centre) / _light(other, centre, exposure))
+                    light = half * (max(other, zero) + max(centre, zero)) + exposure
+                    sums[c, row, x // _CELL] += weight * ((other - centre) / light)
                 sums[C, row, x // _CELL] += weight
 
 
@@ -81,6 +78,7 @@ def _subtract(
     first: int, last: int, there: Floats, here: Floats, trusted: Floats, exposure: np.float32, alike: Floats,
     change: Floats,
 ) -> None:  # fmt: skip
+    half, zero = np.float32(0.5), np.float32(0)
     for y in range(first, last):
         for x in range(there.shape[1]):
             if not trusted[y, x] > alike[y, x]:
@@ -88,5 +86,6 @@ def _subtract(
             share = np.float32(1) - alike[y, x] / trusted[y, x]
             for c in range(there.shape[2]):
                 centre, other = here[y, x, c], there[y, x, c]
-                taken = share * change[y, x, c] * _light(other, centre, exposure)
-                there[y, x, c] = max(other - taken, min(other, np.float32(0)))  # below 0 only where it was
+                light = half * (max(other, zero) + max(centre, zero)) + exposure
+                # Below 0 only where it was.
+                there[y, x, c] = max(other - share * change[y, x, c] * light, min(other, zero))

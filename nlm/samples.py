@@ -13,7 +13,7 @@ from numba import njit
 
 from loops.parallel import Floats, Mask, run_bands
 from nlm.average import channel_mean, check_colors, check_strip, check_window
-from nlm.cells import Axis, blend_columns, blend_rows, cell_axis
+from nlm.cells import Axis, between_cells, cell_axis, cell_means
 from nlm.variance import gaussian_mean, ratio, second_differences
 
 # Deviations of its own noise that are subtracted from the detail that frames share. At 1, noise that looks like detail
@@ -187,12 +187,14 @@ def blend_samples(
     # Where no bright sample is near, the noise is greater than it seems: by two deviations of its own estimate.
     scatter = np.sqrt(gaussian_mean(np.square(products), _SIGMA) / _PIXELS)
     noise = (gaussian_mean(products, _SIGMA) + np.float32(_SCATTER) * scatter) / _PIXELS
-    blended = np.empty_like(picture)
     means = gaussian_mean(together, _SIGMA), gaussian_mean(squares, _SIGMA), noise
-    run_bands(_blend_shared, height, picture, neighbours, factor, means, blended)
-    del together, squares, products, scatter, noise, means, factor
+    del together, squares, products, scatter, noise
+    blended, error = np.empty_like(picture), np.empty_like(rate)
+    run_bands(_blend_shared, height, picture, noisy, neighbours, factor, rate, means, blended, error)
+    del means, factor
     around, nearest = gaussian_mean(temporal, _SIGMA), gaussian_mean(nearest, _SIGMA)
     temporal *= np.divide(np.minimum(nearest, around), around, out=np.ones_like(around), where=around > 0)
+    del around, nearest
     spatial = spatial_variance(noisy, blended, rate, albedo)
     if variance is None:
         alone = np.float32(_ALONE) * spatial
@@ -204,10 +206,12 @@ def blend_samples(
             alone = np.minimum(alone, _GREATEST * greatest * (1 + greatest / _SMALL))
     else:
         alone = np.asarray(variance.sum(axis=-1) * np.square(rate), np.float32)
-    error = np.empty_like(rate)
-    run_bands(_compare_blended, height, blended, noisy, neighbours.trust, rate, temporal, error, alone)
+    # Spatial as far as no neighbour is trusted; at 1 the sum would round.
+    mixed = alone + neighbours.trust * (temporal - alone)
+    np.copyto(mixed, temporal, where=neighbours.trust >= 1)
+    np.minimum(mixed, 3 * _LIMIT * _LIMIT, out=mixed)
     fourth = gaussian_mean(np.square(error), _SIGMA)
-    certainty = gaussian_mean(error, _SIGMA), fourth, gaussian_mean(alone, _SIGMA)
+    certainty = gaussian_mean(error, _SIGMA), fourth, gaussian_mean(mixed, _SIGMA)
     run_bands(_blend_centre, height, noisy, certainty, spatial, neighbours.trust, blended)
     return blended
 
@@ -340,22 +344,27 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
         # Cells of σ / 4 pixels blur nothing that a Gaussian mean keeps.
         side = max(int(sigma / _CELLS), 1)
         rows, columns = (cell_axis(length, side) for length in picture.shape[:2])
-        sums = np.zeros((1 + 7 * bins, len(rows.pixels) // side, len(columns.pixels) // side), np.float32)
+        dark, light = np.float32(1e-3 * exposure), np.maximum(channel_mean(picture), 0)
+        place = level = np.zeros_like(light)
         if bins == 1:
-            run_bands(_sum_levels, sums.shape[1], picture, np.float32(_LAMP * exposure), rows, columns, side, sums)
-        around = gaussian_mean(sums[0] / np.float32(side**2), sigma / side)[None]
-        dark = np.float32(1e-3 * exposure)
-        run_bands(_sum_differences, sums.shape[1], picture, noisy, around, dark, rows, columns, side, sums)
-        means = np.stack([gaussian_mean(part / np.float32(side**2), sigma / side) for part in sums[1:]])
+            lit = np.minimum(light, np.float32(_LAMP * exposure))
+            level = between_cells(gaussian_mean(cell_means(lit, rows, columns), sigma / side), rows, columns)
+        light += np.float32(_SOFT) * level
+        light += dark
+        if bins > 1:
+            place = np.minimum(np.log2(np.maximum(light / dark, 1)) / _STOPS, np.float32(bins - 1))
+        weight = 1 / np.maximum(light, level)
+        sums = np.zeros((7 * bins, len(rows.pixels) // side, len(columns.pixels) // side), np.float32)
+        given = picture, noisy, light, weight, place
+        run_bands(_sum_differences, sums.shape[1], *given, rows, columns, side, sums)
+        means = np.stack([gaussian_mean(part / np.float32(side**2), sigma / side) for part in sums])
         # As many pixels as a Gaussian averages, 1 / Σ weight², and no more than there are.
         pixels = np.float32(min(4 * np.pi * sigma**2, picture.shape[0] * picture.shape[1]))
-        changes = _known_changes(
-            means.reshape(bins, 7, *around.shape[1:]), pixels, np.float32(certain), np.float32(few)
-        )
+        changes = _known_changes(means.reshape(bins, 7, *sums.shape[1:]), pixels, np.float32(certain), np.float32(few))
         if not changes.any():
             continue
-        changes, restored = np.concatenate([around, changes]), np.empty_like(picture)
-        run_bands(_restore, len(picture), picture, changes, dark, rows, columns, restored)
+        restored = np.empty_like(picture)
+        run_bands(_restore, len(picture), picture, changes, light, place, rows, columns, restored)
         picture = restored
     return _with_mean(picture, channel_mean(picture), channel_mean(noisy), np.float32(1e-3 * exposure))
 
@@ -394,70 +403,37 @@ def _known_changes(sums: Floats, pixels: np.float32, certain: np.float32, few: n
     return np.asarray((differences * ratio(share, lit)[:, None]).reshape(-1, *lit.shape[1:]), np.float32)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _bin(light: np.float32, dark: np.float32, bins: int) -> tuple[int, np.float32]:
-    """Return the bin below a light, and the share of the next one."""
-    if bins == 1 or not light > dark:
-        return 0, np.float32(0)
-    place = min(np.log2(light / dark) / _STOPS, np.float32(bins - 1))
-    below = min(int(place), bins - 2)
-    return below, np.float32(place - below)
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _level(image: Floats, y: int, x: int) -> np.float32:
-    """Mean over channels of a pixel, at least 0."""
-    total = np.float32(0)
-    for c in range(3):
-        total += image[y, x, c]
-    return max(total / np.float32(3), np.float32(0))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _sum_levels(
-    first: int, last: int, picture: Floats, lamp: np.float32, rows: Axis, columns: Axis, side: int, sums: Floats
-) -> None:
-    """Sum over cells the level of a picture, up to `lamp`, into the first plane."""
-    for row in range(first, last):
-        for y in rows.pixels[row * side : (row + 1) * side]:
-            for column in range(sums.shape[2]):
-                total = np.float32(0)
-                for x in columns.pixels[column * side : (column + 1) * side]:
-                    total += min(_level(picture, y, x), lamp)
-                sums[0, row, column] += total
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sum_differences(
-    first: int, last: int, picture: Floats, noisy: Floats, around: Floats, dark: np.float32, rows: Axis, columns: Axis,
-    side: int, sums: Floats,
+    first: int, last: int, picture: Floats, noisy: Floats, light: Floats, weight: Floats, place: Floats, rows: Axis,
+    columns: Axis, side: int, sums: Floats,
 ) -> None:  # fmt: skip
-    """Sum over cells, for each bin: weight × light, differences of three channels, square, square², and what is cut."""
-    blended, bins = np.empty((1, around.shape[2]), np.float32), len(sums) // 7
-    cells = np.empty((sums.shape[2], len(sums) - 1), np.float32)
+    """Sum over cells, for each bin: weight × light, differences of three channels, square, square², and what is cut.
+
+    `place` is that of a pixel among the bins: 1.25 for a quarter in the third, and the rest in the second.
+    """
+    bins = len(sums) // 7
+    cells = np.empty((sums.shape[2], len(sums)), np.float32)
     for row in range(first, last):
         cells[:] = 0
         for y in rows.pixels[row * side : (row + 1) * side]:
-            blend_rows(around, rows, y, blended)
             for column in range(sums.shape[2]):
                 for x in columns.pixels[column * side : (column + 1) * side]:
-                    level = blend_columns(blended, 0, columns, x)
-                    light = _level(picture, y, x) + np.float32(_SOFT) * level + dark
-                    weight = np.float32(1) / max(light, level)
+                    scale, reach = weight[y, x], _FAR * light[y, x]
                     red = noisy[y, x, 0] - picture[y, x, 0]
                     green = noisy[y, x, 1] - picture[y, x, 1]
                     blue = noisy[y, x, 2] - picture[y, x, 2]
-                    reach = _FAR * light
-                    r = weight * min(max(red, -reach), reach)
-                    g = weight * min(max(green, -reach), reach)
-                    b = weight * min(max(blue, -reach), reach)
-                    cut = (weight * (red + green + blue) - (r + g + b)) / np.float32(3)
+                    r = scale * min(max(red, -reach), reach)
+                    g = scale * min(max(green, -reach), reach)
+                    b = scale * min(max(blue, -reach), reach)
+                    cut = (scale * (red + green + blue) - (r + g + b)) / np.float32(3)
                     power = (r * r + g * g + b * b) / np.float32(3)
-                    below, above = _bin(light, dark, bins)
+                    below = min(int(place[y, x]), max(bins - 2, 0))
+                    above = np.float32(place[y, x] - below)
                     for near in range(min(bins, 2)):
                         share = above if near else np.float32(1) - above
                         cell = cells[column, 7 * (below + near) :]
-                        cell[0] += share * weight * light
+                        cell[0] += share * scale * light[y, x]
                         cell[1] += share * r
                         cell[2] += share * g
                         cell[3] += share * b
@@ -467,27 +443,34 @@ def _sum_differences(
         # Not `cells.T` at once: numba would compile the text of an error about shapes, for two seconds.
         for plane in range(cells.shape[1]):
             for column in range(len(cells)):
-                sums[1 + plane, row, column] = cells[column, plane]
+                sums[plane, row, column] = cells[column, plane]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _restore(
-    first: int, last: int, picture: Floats, changes: Floats, dark: np.float32, rows: Axis, columns: Axis,
+    first: int, last: int, picture: Floats, changes: Floats, light: Floats, place: Floats, rows: Axis, columns: Axis,
     restored: Floats,
 ) -> None:  # fmt: skip
-    """Add the known relative changes to a picture; their first plane is the light around."""
-    zero, bins = np.float32(0), len(changes) // 3
-    blended = np.empty((changes.shape[0], changes.shape[2]), np.float32)
+    """Add the known relative changes, of three channels for each bin, to a picture."""
+    zero, bins, width = np.float32(0), len(changes) // 3, changes.shape[2]
+    blended = np.empty((len(changes), width), np.float32)
     for y in range(first, last):
-        blend_rows(changes, rows, y, blended)
+        above, below, down = rows.before[y], rows.after[y], rows.share[y]
+        for k in range(len(changes)):
+            for column in range(width):
+                upper = changes[k, above, column]
+                blended[k, column] = upper + down * (changes[k, below, column] - upper)
         for x in range(picture.shape[1]):
-            light = _level(picture, y, x) + np.float32(_SOFT) * blend_columns(blended, 0, columns, x) + dark
-            below, above = _bin(light, dark, bins)
+            before, after, across = columns.before[x], columns.after[x], columns.share[x]
+            low = min(int(place[y, x]), max(bins - 2, 0))
+            share = np.float32(place[y, x] - low)
             for c in range(3):
-                change = blend_columns(blended, 1 + 3 * below + c, columns, x)
-                if above > zero:
-                    change += above * (blend_columns(blended, 4 + 3 * below + c, columns, x) - change)
-                restored[y, x, c] = max(picture[y, x, c] + light * change, min(picture[y, x, c], zero))
+                k = 3 * low + c
+                change = blended[k, before] + across * (blended[k, after] - blended[k, before])
+                if share > zero:
+                    other = blended[k + 3, before]
+                    change += share * (other + across * (blended[k + 3, after] - other) - change)
+                restored[y, x, c] = max(picture[y, x, c] + light[y, x] * change, min(picture[y, x, c], zero))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -562,10 +545,13 @@ def _compare(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _blend_shared(
-    first: int, last: int, picture: Floats, neighbours: SampleMean, factor: Floats,
-    means: tuple[Floats, Floats, Floats], blended: Floats,
+    first: int, last: int, picture: Floats, noisy: Floats, neighbours: SampleMean, factor: Floats, rate: Floats,
+    means: tuple[Floats, Floats, Floats], blended: Floats, error: Floats,
 ) -> None:  # fmt: skip
-    """Blend the neighbours' mean into a picture where both frames show the same difference."""
+    """Blend the neighbours' mean into a picture where both frames show the same difference.
+
+    With the squared difference of the result from the samples, relative to the light.
+    """
     together, squares, noise = means
     zero, one = np.float32(0), np.float32(1)
     for y in range(first, last):
@@ -573,27 +559,13 @@ def _blend_shared(
             found = together[y, x] - np.float32(_DEVIATIONS) * np.sqrt(noise[y, x])
             share = found / squares[y, x] if squares[y, x] > zero else zero
             share = min(max(share, zero), one) * neighbours.trust[y, x]
+            total = zero
             for c in range(3):
                 own = picture[y, x, c]
-                blended[y, x, c] = own + share * (neighbours.mean[y, x, c] * factor[y, x] - own)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _compare_blended(
-    first: int, last: int, blended: Floats, noisy: Floats, trust: Floats, rate: Floats, temporal: Floats,
-    error: Floats, variance: Floats,
-) -> None:  # fmt: skip
-    """Write the squared difference from the samples, and their variance, which is spatial as far as none is trusted."""
-    for y in range(first, last):
-        for x in range(rate.shape[1]):
-            total = np.float32(0)
-            for c in range(3):
-                difference = (noisy[y, x, c] - blended[y, x, c]) * rate[y, x]
-                total += min(max(difference, -_LIMIT), _LIMIT) ** 2
+                own += share * (neighbours.mean[y, x, c] * factor[y, x] - own)
+                total += min(max((noisy[y, x, c] - own) * rate[y, x], -_LIMIT), _LIMIT) ** 2
+                blended[y, x, c] = own
             error[y, x] = total
-            mixed = variance[y, x] + trust[y, x] * (temporal[y, x] - variance[y, x])
-            mixed = temporal[y, x] if trust[y, x] >= np.float32(1) else mixed
-            variance[y, x] = min(mixed, np.float32(3) * _LIMIT * _LIMIT)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

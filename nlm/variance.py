@@ -19,6 +19,8 @@ _WARPED = 0.7
 # Variance of guides without noise: deviations of a thousandth of their range. In tiles with no more the filter would
 # change 1e-4 (RMS, five shots).
 _NOISELESS = np.float32(1e-6)
+# Least variance, of deviations of 1e-4: below that is what the box filters round to, which depends on where they began.
+_LEAST = np.float32(1e-8)
 # Beyond this share of the columns a window is filtered as a whole.
 _MOST_COLUMNS = 0.75
 # Radius, pixels, of the boxes that smooth variances.
@@ -57,8 +59,14 @@ def _temporal_variance(window: Floats, confidence: Floats) -> tuple[Floats, Floa
 
 def _fade(temporal: Floats, spatial: Floats, trust: Floats) -> Floats:
     """Blend from spatial to temporal variance by `trust`."""
+    # For each channel: numpy takes long to spread a plane over the short axis.
+    share = cv2.merge([trust] * temporal.shape[2]).reshape(temporal.shape)
+    mixed = temporal - spatial
+    mixed *= share
+    mixed += spatial
     # Not the sum where trust is 1: it would round otherwise in a part of a frame than in the whole.
-    return np.where(trust[..., None] >= 1, temporal, spatial + trust[..., None] * (temporal - spatial))
+    np.copyto(mixed, temporal, where=share >= 1)
+    return mixed
 
 
 def variance_from_residual(image: Floats) -> Floats:
@@ -128,9 +136,9 @@ def prefilter_noisy_rows(centre: Floats, read: Callable[[slice], Floats], confid
         for columns in parts:
             guides, trusted = check_window(window[:, :, columns], confidence[:, rows, columns], "confidence")
             temporal, trust = _temporal_variance(guides, trusted)
-            variance, noisy = np.empty_like(temporal), np.empty(trust.shape, np.bool_)
-            lone = np.ascontiguousarray(spatial[rows, columns])  # a view would be compiled for once more
-            run_bands(_lesser_variance, len(trust), temporal, lone, trust, variance, noisy)
+            variance = _fade(temporal, spatial[rows, columns], trust)
+            np.clip(variance, _LEAST, np.maximum(spatial[rows, columns], _LEAST), out=variance)
+            noisy = np.logical_or.reduce([plane > _NOISELESS for plane in np.moveaxis(variance, -1, 0)])
             filtered[rows, columns] = joint_nlm(
                 guides, variance, confidence=trusted, radius=1, patch_radius=1, k=1.0, where=noisy
             )
@@ -176,21 +184,3 @@ def _centre_deviation(
                         mean += confidence[t, y, x] * window[t, y, x, c]
                 difference = window[centre, y, x, c] - mean / total
                 deviation[y, x, c] = difference**2 / (1 + np.float32(_WARPED) * squares / (total * total))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _lesser_variance(
-    first: int, last: int, temporal: Floats, spatial: Floats, trust: Floats, variance: Floats, noisy: Mask
-) -> None:
-    """Write the lesser of both variances, the temporal one as `_fade` has it, and where there is noise."""
-    # At least 1e-8, deviations of 1e-4: below that is what the box filters round to, which depends on where they began.
-    least = np.float32(1e-8)
-    for y in range(first, last):
-        for x in range(trust.shape[1]):
-            noise = False
-            for c in range(spatial.shape[2]):
-                faded = spatial[y, x, c] + trust[y, x] * (temporal[y, x, c] - spatial[y, x, c])
-                faded = temporal[y, x, c] if trust[y, x] >= np.float32(1) else faded
-                variance[y, x, c] = max(min(faded, spatial[y, x, c]), least)
-                noise = noise or variance[y, x, c] > _NOISELESS
-            noisy[y, x] = noise

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nlm.cells import blend_columns, blend_rows, cell_axis
+from nlm.cells import between_cells, cell_axis, cell_means
 
 
 @pytest.mark.parametrize(("length", "side"), [(16, 4), (13, 4), (3, 8), (1, 2)])
@@ -19,17 +19,18 @@ def test_cells_cover_the_pixels_and_mirror_what_is_missing(length, side):
         np.testing.assert_array_equal(axis.pixels[length:], np.arange(length)[::-1][: len(axis.pixels) - length])
 
 
+@pytest.mark.parametrize("shape", [(12, 20), (13, 18)])
+def test_means_of_cells_are_those_of_their_pixels(shape):
+    rows, columns = (cell_axis(length, 4) for length in shape)
+    plane = np.random.default_rng(1).random(shape, np.float32)
+    whole = plane[rows.pixels[:, None], columns.pixels]
+    expected = whole.reshape(len(rows.pixels) // 4, 4, -1, 4).mean(axis=(1, 3))
+    np.testing.assert_allclose(cell_means(plane, rows, columns), expected, rtol=1e-6)  # sums of 16 float32
+
+
 def test_values_between_cells_are_linear_and_level_beyond_the_outermost():
-    rows, columns = cell_axis(12, 4), cell_axis(20, 4)
+    rows, columns = cell_axis(11, 4), cell_axis(20, 4)
     y, x = np.mgrid[:3, :5].astype(np.float32)
-    planes, blended = np.stack([4 * x + 1.5, 4 * y + 1.5]), np.empty((2, 5), np.float32)
-    found = np.empty((2, 12, 20), np.float32)
-    for row in range(12):
-        blend_rows(planes, rows, row, blended)
-        for column in range(20):
-            for k in range(2):
-                found[k, row, column] = blend_columns(blended, k, columns, column)
-    np.testing.assert_allclose(found[0], np.broadcast_to(np.clip(np.arange(20), 1.5, 17.5), (12, 20)), rtol=1e-6)
-    np.testing.assert_allclose(
-        found[1], np.broadcast_to(np.clip(np.arange(12), 1.5, 9.5)[:, None], (12, 20)), rtol=1e-6
-    )
+    across, down = (between_cells(4 * place + 1.5, rows, columns) for place in (x, y))
+    np.testing.assert_allclose(across, np.broadcast_to(np.clip(np.arange(20), 1.5, 17.5), (11, 20)), rtol=1e-6)
+    np.testing.assert_allclose(down, np.broadcast_to(np.clip(np.arange(11), 1.5, 9.5)[:, None], (11, 20)), rtol=1e-6)
