@@ -116,7 +116,7 @@ def test_nonfinite_pixels_are_counted_filled_and_stay_local(tmp_path):
 
     good = align(SCENE.write(tmp_path / "good"))
     spoilt = align(SCENE.write(tmp_path / "spoilt", edit=spoil))
-    assert (good.repaired, spoilt.repaired) == (0, 3)
+    assert (good.centre.frame.repaired, spoilt.centre.frame.repaired) == (0, 3)
     assert spoilt.confidence[2, 10, 12] == 0
     image, plain = filter_window(spoilt, STANDARD), filter_window(good, STANDARD)
     assert np.isfinite(image).all()

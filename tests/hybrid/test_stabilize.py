@@ -189,7 +189,7 @@ def test_of_the_frame_before_only_what_is_averaged_is_kept(tmp_path):
     maker.make(MIDDLE + 1)
     for before in (first, maker._results[MIDDLE]):
         assert before.neighbour_samples is before.drift_weight is None
-        assert not before.trust
+        assert not before.geometry
     np.testing.assert_array_equal(maker.make(MIDDLE).denoised.color, color)
 
 
