@@ -36,7 +36,7 @@ class Chunk(NamedTuple):
 
 def arguments_of(context: typer.Context, changes: Mapping[str, Any]) -> list[str]:
     """Return the arguments of this command as they were given, with some parameters changed."""
-    words, positional = [str(context.info_name)], []
+    options, positional = [str(context.info_name)], []
     for parameter in context.command.params:
         name = str(parameter.name)
         value = changes.get(name, context.params.get(name))
@@ -46,10 +46,10 @@ def arguments_of(context: typer.Context, changes: Mapping[str, Any]) -> list[str
         if parameter.param_type_name == "argument":
             positional += values
         elif value is True:
-            words.append(_longest(parameter.opts))
+            options.append(_longest(parameter.opts))
         else:  # with "=", as a value may begin with a hyphen
-            words += [f"{_longest(parameter.opts)}={item}" for item in values]
-    return [*words, "--", *positional]
+            options += [f"{_longest(parameter.opts)}={item}" for item in values]
+    return [*options, "--", *positional]
 
 
 def _longest(names: Sequence[str]) -> str:
@@ -88,8 +88,8 @@ class ChunkLog:
         """Log that a chunk is done, or its fault, without an error that is logged already."""
         if fault:
             self._failed.append(name)
-            for words in self._errors[name]:
-                fault = fault.replace(f": {words}", "")
+            for message in self._errors[name]:
+                fault = fault.replace(f": {message}", "")
             LOG.error(f"{name}: {fault}")
         else:
             self.add(name, {"percent": 100, "message": f"{name} done"})
@@ -153,10 +153,10 @@ def run_command(
     """
     inherited = {key: value for key, value in os.environ.items() if key not in ("RAVG_SCHEDULER", "RAVG_LOG_FILE")}
     search = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "PYTHONUTF8": "1"}
-    words = list(arguments)
-    words.insert(words.index("--"), "--log-format=json")
+    command = list(arguments)
+    command.insert(command.index("--"), "--log-format=json")
     process = subprocess.Popen(
-        [sys.executable, "-m", "hybrid.cli", *words],
+        [sys.executable, "-m", "hybrid.cli", *command],
         cwd=folder,
         env={**inherited, **search, **environment},
         stdin=subprocess.DEVNULL,

@@ -39,7 +39,7 @@ from hybrid.validation import Finding
 
 @dataclass(frozen=True)
 class Request:
-    """The options of the command, of one view."""
+    """The options of the command, of all views or of one."""
 
     shot: shots.ShotInput
     output: str
@@ -61,6 +61,19 @@ class Request:
         writes = {"preview": self.preview, "contact-sheet": self.contact_sheet, "log-file": log_file()}
         return Paths({"profile": self.shot.profile}, writes)
 
+    def of_views(self) -> list[tuple[str, "Request"]]:
+        """Return the stereo views, or "", each with its own request; BadParameter for names that all would share."""
+        views, first_pass = shots.views_of(self.shot.shot), self.options.first_pass
+        files = {
+            "first-pass": None if first_pass in SPECS else first_pass,
+            "preview": self.preview,
+            "contact-sheet": self.contact_sheet,
+            "breakdown": self.options.breakdown,
+        }
+        folders = {"output": self.output, "keep-first-pass": self.options.keep_first_pass}
+        shots.expect_views_apart(views, self.shot, folders, files)
+        return [(view, shots.in_view(self, view)) for view in views]
+
 
 @opt.command("denoise", opt.ReadOptions, DenoiseOptions)
 def denoise(
@@ -81,48 +94,42 @@ def denoise(
     **settings: Any,
 ) -> None:
     """Denoise each view of a shot, in this process, in several, or on a cluster."""
-    how = opt.take(opt.ReadOptions, settings)
+    reading = opt.take(opt.ReadOptions, settings)
     with opt.usage():
         options = DenoiseOptions(
             **settings,
             stages=shots.split_stages(stages),
             no_stages=shots.split_stages(no_stages),
             device=device,
-            strict=how["strict"],
+            strict=reading["strict"],
         )
         if (scheduler is not None or jobs > 1) and (options.budget is not None or options.breakdown is not None):
             raise ValueError("--budget and --breakdown are of one process, expected no --scheduler or --jobs with them")
         if scheduler is not None and jobs > 1:
             raise ValueError("--jobs are processes on this machine, expected no --scheduler with them")
-    read = shots.ShotInput(shot=shot, aovs=tuple(aov or ()), max_pixels=max_pixels, **how)
-    request = Request(read, output, options, preview, contact_sheet, fps)
+    source = shots.ShotInput(shot=shot, aovs=tuple(aov or ()), max_pixels=max_pixels, **reading)
+    requests = Request(source, output, options, preview, contact_sheet, fps).of_views()
     if options.method == "network":
         shots.import_neural()
-    views = shots.views_of(shot)
-    sequence = None if options.first_pass in SPECS else options.first_pass
-    pictures = {"preview": preview, "contact-sheet": contact_sheet, "breakdown": options.breakdown}
-    folders = {"output": output, "keep-first-pass": options.keep_first_pass}
-    shots.expect_views_apart(views, read, folders, {"first-pass": sequence, **pictures})
     failed = False
-    for view in views:
+    for view, request in requests:
         if view:
             LOG.info(f"view {view}")
-        here = shots.in_view(request, view)
         try:
             if scheduler is not None:
                 # A chunk that is run again, after its worker died, skips the frames that are finished.
                 _denoise_in_chunks(
-                    context, here, view, lambda _: chunk, {"resume": True}, partial(run_on_cluster, scheduler)
+                    context, request, view, lambda _: chunk, {"resume": True}, partial(run_on_cluster, scheduler)
                 )
             elif jobs > 1:
                 # Chunks as long as possible: each computes its neighbours as well.
                 limit = options.max_memory and f"{parse_size(options.max_memory) // jobs / 2**20:.3f}M"
                 changes = {"max_memory": limit, "jobs": None}
                 _denoise_in_chunks(
-                    context, here, view, lambda count: -(-count // jobs), changes, partial(run_jobs, jobs)
+                    context, request, view, lambda count: -(-count // jobs), changes, partial(run_jobs, jobs)
                 )
             else:
-                _denoise(here)
+                _denoise(request)
         except typer.Exit as end:
             if not options.keep_going or end.exit_code == INTERRUPTED:
                 raise
@@ -227,8 +234,8 @@ def _failure_on_record(request: Request, shot: Shot) -> Iterator[None]:
             first = output_path(request.output, shot, shot.numbers[0])
             name, spec = sequence_name(first), request.shot.shot
             record = Record(first.parent, name, shot.numbers, command="denoise", input=spec)
-            there = dict(read_records(first.parent, name))
-            if not there.get(record.path, {}).get("frames"):
+            documents = dict(read_records(first.parent, name))
+            if not documents.get(record.path, {}).get("frames"):
                 record.write(Timings(), "failed", error=one_line(error))
         raise
 
@@ -251,12 +258,12 @@ def _summarize_job(job: Job) -> None:
     parts = [f"ravg {version('ravg')}", method, f"preset {job.preset}", *map(str, filter(None, computed))]
     summarize("Settings", ", ".join(filter(None, parts)))
     used, missing = [], []
-    for role, words in ROLE_FACTS.items():
-        name, layer = words.get("summary"), getattr(layers, role)
+    for role, texts in ROLE_FACTS.items():
+        name, layer = texts.get("summary"), getattr(layers, role)
         if name and layer is not None:
             used.append(f"{name} ({layer.file})" if layer.file else name)
-        elif "without" in words and layer is None:
-            missing.append(f"{name} ({words['without']})")
+        elif "without" in texts and layer is None:
+            missing.append(f"{name} ({texts['without']})")
     summarize("Passes", "; without ".join([", ".join(used), *filter(None, [", ".join(missing)])]))
     later = f"; {job.first_pass} for the last" if job.options.passes > 1 else ""
     summarize("First pass", f"{source.name} ({source.reason}){later}")
@@ -292,8 +299,8 @@ def _finish(
         each = f", {cost.seconds / len(made):.2g} s per frame"
         peak = f"peak memory {cost.peak / 2**20:.0f} MiB{cost.of}"
         summarize("Total", f"{duration(cost.seconds)}{each}, {peak}")
-    words = ["ravg", "view", request.output, "--beside", request.shot.shot]
-    summarize("Next", subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words))
+    command = ["ravg", "view", request.output, "--beside", request.shot.shot]
+    summarize("Next", subprocess.list2cmdline(command) if os.name == "nt" else shlex.join(command))
     summarize("Details", details)
     _write_pictures(request, view, {*made, *there})
     if job is not None:
@@ -317,9 +324,9 @@ class _Report:
     def add(self, frame: Finished | Failed) -> str:
         """Add a frame; return the message of the progress bar."""
         if isinstance(frame, Failed):
-            words = one_line(frame.error)
-            LOG.error(f"frame {frame.number}: {words}")
-            self.record.add(frame.number, "failed", error=words)
+            message = one_line(frame.error)
+            LOG.error(f"frame {frame.number}: {message}")
+            self.record.add(frame.number, "failed", error=message)
             self.record.write(self.job.timings)
             return f"frame {frame.number} failed"
         self.pixels += frame.pixels
@@ -377,12 +384,12 @@ class _Report:
 def _run(job: Job, record: Record) -> None:
     """Denoise; log progress, and everything that happens to a frame."""
     view = job.views[0]
-    taken = view.layers(view.numbers[0])
-    layers = summarize_layers(taken)
+    roles = view.layers(view.numbers[0])
+    layers = summarize_layers(roles)
     LOG.debug(printable(f"layers: {layers}"))
-    found = [finding.message for finding in job.report.findings if not finding.warning]
-    for words in (*taken.notes, *found, *view.recompressed_parts(job.views[1:])):
-        summarize("Note", words)
+    messages = [finding.message for finding in job.report.findings if not finding.warning]
+    for note in (*roles.notes, *messages, *view.recompressed_parts(job.views[1:])):
+        summarize("Note", note)
     findings = [vars(finding) for finding in job.report.findings]
     record.write(job.timings, layers=layers, warnings=view.warnings, findings=findings)
     report, bar = _Report(job, record), Progress("denoise", job.total())
@@ -414,9 +421,9 @@ def _print_weights(job: Job) -> None:
     LOG.info(f"wrote {job.options.breakdown}")
 
 
-def _write_pictures(request: Request, shot: Shot, made: Collection[int]) -> None:
+def _write_pictures(request: Request, shot: Shot, finished: Collection[int]) -> None:
     """Write the preview and the contact sheet of the frames that are made, if any is."""
-    shot = replace(shot, numbers=tuple(number for number in shot.numbers if number in made))
+    shot = replace(shot, numbers=tuple(number for number in shot.numbers if number in finished))
     if request.preview is not None and shot.numbers:
         write_preview(shot, request.output, request.preview, rate=request.fps)
         LOG.info(f"wrote {request.preview}")

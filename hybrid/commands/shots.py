@@ -97,18 +97,18 @@ def views_of(spec: str) -> list[str]:
 
 def in_view(value: Value, view: str) -> Value:
     """Put the name of a view into all names that a value holds: strings, paths, lists and dataclasses of them."""
-    found: Any = value
+    named: Any = value
     if not view:
         return value
     if isinstance(value, str):
-        found = name_view(value, view)
+        named = name_view(value, view)
     elif isinstance(value, Path):
-        found = Path(name_view(str(value), view))
+        named = Path(name_view(str(value), view))
     elif isinstance(value, list | tuple):
-        found = type(value)(in_view(item, view) for item in value)
+        named = type(value)(in_view(item, view) for item in value)
     elif is_dataclass(value):
-        found = replace(value, **{f.name: in_view(getattr(value, f.name), view) for f in fields(value)})  # type: ignore[type-var]
-    return found  # type: ignore[no-any-return]
+        named = replace(value, **{f.name: in_view(getattr(value, f.name), view) for f in fields(value)})  # type: ignore[type-var]
+    return named  # type: ignore[no-any-return]
 
 
 def expect_views_apart(
