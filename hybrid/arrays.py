@@ -32,7 +32,7 @@ ALIKE = 0.8  # similarity by `difflib` from which on a name is a known one with 
 
 
 class ArrayFrames:
-    """Frames in memory, read as those of a shot; parameters are those of `denoise_arrays`."""
+    """Frames in memory with the interface of a shot; parameters as for `denoise_arrays`."""
 
     def __init__(self, frames: Layers, motion: str | None = None) -> None:
         listed = range(len(frames)) if isinstance(frames, Sequence) else ()
@@ -102,12 +102,12 @@ class ArrayFrames:
         layers = self._frames[number]
         if not isinstance(layers, Mapping):
             raise ValueError(f"frame {number} is a {type(layers).__name__}, expected names of layers and their arrays")
-        found = {name: np.asarray(layer) for name, layer in layers.items()}
-        for name, layer in found.items():
+        arrays = {name: np.asarray(layer) for name, layer in layers.items()}
+        for name, layer in arrays.items():
             if layer.dtype.kind != "f":
                 expected = "float radiance, scene-linear" if name in ("color", "estimate") else "float"
                 raise ValueError(f"frame {number}: {name} has type {layer.dtype}, expected {expected}")
-        return {name: np.asarray(layer, np.float32) for name, layer in found.items()}
+        return {name: np.asarray(layer, np.float32) for name, layer in arrays.items()}
 
 
 def _as_aov(layer: Array) -> Array:
@@ -219,7 +219,7 @@ def denoise_arrays(
     shot = ArrayFrames(frames, motion)
     if chosen.method != "network" and shot.aovs:
         raise ValueError(f"{shot.aovs[0]!r} is an AOV, expected none, as {chosen.method} denoises the color alone")
-    if chosen.aov_sum == "beauty" and not any(found.whole == BEAUTY and found.complete for found in shot.passes.sums):
+    if chosen.aov_sum == "beauty" and not any(total.whole == BEAUTY and total.complete for total in shot.passes.sums):
         raise ValueError("aov_sum is 'beauty', expected AOVs of which the color is the sum")
     if not (numbers is None or isinstance(numbers, Collection)):
         raise ValueError(f"numbers is {numbers!r}, expected a list of frame numbers")
@@ -238,11 +238,11 @@ def denoise_arrays(
         if wanted and (doubt := _doubt_vectors(shot, wanted[0])) is not None:
             warnings.warn(doubt, stacklevel=2)
         for number in wanted:
-            made = denoise.make(number)
-            if made.repaired == np.prod(shot.shape):
+            frame = denoise.make(number)
+            if frame.repaired == np.prod(shot.shape):
                 warnings.warn(f"frame {number}: no pixel of color is finite; expected a rendered frame", stacklevel=2)
-            layers = {"color": made.denoised.color, **made.denoised.aovs, **shot.kept(number)}
-            result = ArrayResult(number, layers, made.plan)
+            layers = {"color": frame.denoised.color, **frame.denoised.aovs, **shot.kept(number)}
+            result = ArrayResult(number, layers, frame.plan)
             yield result
             if progress is not None and progress(result) is False:
                 return

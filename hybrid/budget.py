@@ -26,8 +26,8 @@ class Measured(NamedTuple):
 
 def parse_budget(text: str) -> float:
     """Seconds of "10s", "500ms", "2m" or "10"; ValueError if `text` is no positive duration."""
-    found = re.fullmatch(r"(\d+(?:\.\d+)?|\.\d+)\s*(ms|s|m|min)?", text.strip())
-    seconds = float(found[1]) * {"ms": 1e-3, "m": 60.0, "min": 60.0}.get(found[2], 1.0) if found else 0.0
+    match = re.fullmatch(r"(\d+(?:\.\d+)?|\.\d+)\s*(ms|s|m|min)?", text.strip())
+    seconds = float(match[1]) * {"ms": 1e-3, "m": 60.0, "min": 60.0}.get(match[2], 1.0) if match else 0.0
     if seconds <= 0:
         raise ValueError(f"budget is {text!r}, expected a time per frame such as 10s, 500ms or 2m")
     return seconds

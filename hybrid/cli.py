@@ -60,11 +60,11 @@ class LazyCommand(TyperCommand):
         command = getattr(import_module(f"hybrid.commands.{module}"), function)
         single = typer.Typer(add_completion=False)
         single.command(self.name, cls=Command, help=self._entry.help)(command)
-        made: Any = typer.main.get_command(single)
-        for parameter in made.params:
+        loaded: Any = typer.main.get_command(single)
+        for parameter in loaded.params:
             if getattr(parameter, "is_flag", False):
                 parameter.metavar = " "  # no "<bool>" behind the name of a flag
-        return made
+        return loaded
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
         return self.load().make_context(info_name, args, parent, **extra)

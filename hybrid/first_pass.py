@@ -119,7 +119,7 @@ NO_BACKENDS = Backends()
 
 @dataclass(frozen=True)
 class FirstPassSource:
-    name: str  # what was taken; written to the header of the output
+    name: str  # of the source; written to the header of the output
     first_pass: FirstPass | None  # for a `FrameStream`; None for none
     reason: str  # why this one
     files: Shot | None = None  # the finished sequence that it is read from, if it is one
@@ -235,7 +235,7 @@ def _oidn(mode: str, denoise: Callable[..., Array], in_torch: bool, store: "_Kep
 
 
 class _KeptPictures:
-    """OIDN's pictures on disk, each with a record of what it was made from.
+    """OIDN's pictures on disk, each with a record of its sources.
 
     `spec` is a pattern or a folder; for one of several views, a folder of its own there. `mode` is a key of
     `OIDN_MODES`; `in_torch` networks are less exact. Raises ValueError if `spec` is one name for several frames,
@@ -283,8 +283,8 @@ class _KeptPictures:
 def _folder_name(picture: str) -> str:
     """A folder's name for a picture: its own, or where no folder can be called so, one that no other picture has."""
     plain = re.sub(r"[^\w.-]|^\.", "_", picture)
-    known = hashlib.sha256(picture.encode(errors="surrogateescape")).hexdigest()[:8]
-    return plain if plain == picture else f"{plain}-{known}"
+    digest = hashlib.sha256(picture.encode(errors="surrogateescape")).hexdigest()[:8]
+    return plain if plain == picture else f"{plain}-{digest}"
 
 
 def _run_oidn(color: Array, *guides: Array | None, **mode: Any) -> Array:
@@ -324,14 +324,14 @@ def _denoise_turned(frame: Frame, denoise: Callable[..., Array], **mode: Any) ->
     return np.ascontiguousarray(image[:, ::-1] if mirrored else image)
 
 
-def _checked(found: Array | None, frame: Frame, highlights: Highlights | None = None) -> Array | None:
+def _checked(picture: Array | None, frame: Frame, highlights: Highlights | None = None) -> Array | None:
     """A first pass that fits its frame, finite, without highlights that are not in the frame, and their halos."""
-    if found is None:
+    if picture is None:
         return None
     what = f"the first pass of frame {frame.number}"
-    if found.shape != frame.color.shape:
-        raise ValueError(f"{what} has shape {found.shape}, expected {frame.color.shape}")
-    filled, lost = replace_nonfinite(found)
+    if picture.shape != frame.color.shape:
+        raise ValueError(f"{what} has shape {picture.shape}, expected {frame.color.shape}")
+    filled, lost = replace_nonfinite(picture)
     noisy, bad = replace_nonfinite(frame.color)
     # Pixels that the renderer has lost as well do not count.
     if (count := np.count_nonzero(lost & ~bad)) > LOST * lost.size:
@@ -345,10 +345,10 @@ def _checked(found: Array | None, frame: Frame, highlights: Highlights | None = 
 
 
 def denoise_frame_oidn(frame: Frame, denoise: Callable[..., Array] | None = None, **mode: Any) -> Array:
-    """Run OIDN, or what stands for it, on a frame made finite, with its guides: (H, W, 3) linear radiance."""
+    """Run OIDN, or its replacement, on a frame made finite, with its guides: (H, W, 3) linear radiance."""
     color = _extended(replace_nonfinite(frame.color)[0])
     if not color.max() > 0:
-        return np.zeros_like(frame.color)  # networks leave 1e-4 on black, whatever the light of other frames
+        return np.zeros_like(frame.color)  # networks leave 1e-4 on black
     layers = (frame.albedo, frame.normal)
     guides = [None if layer is None else _extended(replace_nonfinite(layer)[0]) for layer in layers]
     albedo, normal = guides if guides[0] is not None else (None, None)  # OIDN takes no normal alone
@@ -368,9 +368,9 @@ def read_denoised(sequence: Shot, number: int) -> Array:
     That is the estimate, where the color is the noisy picture beside it; else the color, as in every file that ravg has
     written over it.
     """
-    found = sequence.read(number)
-    if found.estimate is None:
-        return found.color
+    frame = sequence.read(number)
+    if frame.estimate is None:
+        return frame.color
     layers = sequence.layers(number)
     replaced = layers.target == layers.color and MADE_FROM in sequence.header(number).parts[0].header
-    return found.color if replaced else found.estimate
+    return frame.color if replaced else frame.estimate

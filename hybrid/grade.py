@@ -73,8 +73,8 @@ def _tiles(picture: Array, samples: Array) -> tuple[Array, Array, Array]:
         np.asarray(layer[:height, :width], np.float64).reshape(split).swapaxes(1, 2).reshape(-1, TILE**2, 3)
         for layer in (picture, samples)
     ]
-    known = np.isfinite(both[0]).all(axis=(1, 2)) & np.isfinite(both[1]).all(axis=(1, 2))
-    e, s = both[0][known], both[1][known]
+    finite = np.isfinite(both[0]).all(axis=(1, 2)) & np.isfinite(both[1]).all(axis=(1, 2))
+    e, s = both[0][finite], both[1][finite]
     level = s.mean(axis=1) / np.maximum(e.mean(axis=1), np.finfo(np.float32).tiny)  # no division by 0 on black
     return e.mean(axis=1), s.mean(axis=1), (s - level[:, None] * e).std(axis=1) / TILE
 

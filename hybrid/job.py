@@ -1,4 +1,4 @@
-"""One description of what is asked for and one way to run it: command, Python, chunks on a cluster, ``--resume``."""
+"""The options of a run, and the one way to run it: for the command, Python, chunks on a cluster and ``--resume``."""
 
 from __future__ import annotations  # `help` then shows the names of types, not what they stand for
 
@@ -146,8 +146,8 @@ class DenoiseOptions:
                 kinds = get_args(hint) or (hint,)
                 accepted = any(isinstance(value, ACCEPTED[kind]) for kind in kinds)
                 if not accepted or (isinstance(value, bool) and bool not in kinds):
-                    words = " or ".join(TYPE_NAMES[kind] for kind in kinds if kind is not NoneType)
-                    raise ValueError(f"{name} is {value!r}, expected {words}")
+                    expected = " or ".join(TYPE_NAMES[kind] for kind in kinds if kind is not NoneType)
+                    raise ValueError(f"{name} is {value!r}, expected {expected}")
                 if isinstance(value, (str, Path)):
                     object.__setattr__(self, name, Path(value) if Path in kinds else str(value))
 
@@ -323,7 +323,7 @@ def choose_first_pass(view: Shot, options: DenoiseOptions, denoiser: WindowDenoi
 
 
 class Paths(NamedTuple):
-    """Files of a run beside its frames, by what they are called: those that are read, and those that are written."""
+    """Files of a run beside its frames, by the names of their options: those read, and those written."""
 
     reads: Mapping[str, str | Path | None] = {}
     writes: Mapping[str, Path | None] = {}
@@ -365,8 +365,8 @@ def validate_views(shot: Shot, *, strict: bool = False) -> tuple[tuple[Shot, ...
     reports = [validate_layers(view) for view in shot.views]
     findings = [finding for report in reports for finding in report.findings]
     report = replace(reports[0], findings=tuple(dict.fromkeys(findings)))
-    if strict and (words := [*shot.warnings, *report.warnings]):
-        raise ValueError("; ".join(words))
+    if strict and (lines := [*shot.warnings, *report.warnings]):
+        raise ValueError("; ".join(lines))
     return tuple(own.apply(view) for own, view in zip(reports, shot.views, strict=True)), report
 
 
@@ -376,7 +376,7 @@ def _check_views(views: Sequence[Shot], report: ValidationReport, options: Denoi
         plan_cuts = plan_shot(view).cuts if options.strict else ()
         if cuts := [cut for pair in plan_cuts if (cut := find_cut(*pair)) not in report.findings]:
             raise ValueError("; ".join(cut.message for cut in cuts))
-        complete = any(found.whole == BEAUTY and found.complete for found in view.passes.sums)
+        complete = any(total.whole == BEAUTY and total.complete for total in view.passes.sums)
         if options.aov_sum == "beauty" and view.aovs and not complete:
             raise ValueError(
                 f"{view.path(view.numbers[0])}: --aov-sum beauty: no layers add up to the beauty, all of them "
@@ -537,7 +537,7 @@ class Job:
         )
 
     def margins(self) -> list[int]:
-        """For each pass, the frames on each side of those asked for that later passes need."""
+        """For each pass, the frames on each side of the requested ones that later passes need."""
         support = temporal_support(None, self.denoiser.radius, self.options.rules)
         return [support * (self.options.passes - number) for number in range(1, self.options.passes + 1)]
 

@@ -44,12 +44,12 @@ PIECES = 1.1
 _UNITS = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 
 
-def parse_size(words: str) -> int:
+def parse_size(text: str) -> int:
     """Bytes of a size such as ``8G``, ``8GiB`` or ``500M``, in powers of 1024; ValueError if it is none, or absurd."""
-    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT])(?:i?B)?\s*", words, re.IGNORECASE)
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT])(?:i?B)?\s*", text, re.IGNORECASE)
     size = 0.0 if match is None else float(match[1]) * _UNITS[match[2].upper()]
     if not 1 <= size < 2.0**63:
-        shown = words if len(words) < 60 else f"{words[:56]}…"
+        shown = text if len(text) < 60 else f"{text[:56]}…"
         raise ValueError(f"max-memory is {shown!r}, expected a size with its unit, such as 8G or 500M")
     return int(size)
 
@@ -58,7 +58,7 @@ class MemoryPlan(NamedTuple):
     """How a run stays within its limit."""
 
     rows: int | None  # of a frame that are worked on at a time, a multiple of 64; None for all
-    in_files: bool  # whether what is kept for later windows lies in temporary files
+    in_files: bool  # whether the values that later windows read lie in temporary files
     trims: bool  # whether freed memory is returned to the system before stages that take much of it
     background: bool  # whether the next frame is read, and the last one written, while a frame is worked on
 
@@ -74,14 +74,14 @@ def plan_memory(
     first_network: Callable[[tuple[int, int]], int] = lambda _: 0,
     filters_guides: bool = False,
 ) -> MemoryPlan:
-    """Plan a run: whole frames in memory if they fit, else with what is kept in files, and as many rows as then fit.
+    """Plan a run: whole frames in memory if they fit, else with kept values in files, and as many rows as then fit.
 
     With memory to spare a frame is read and one is written in the background: 0.93 of the time of `fast` at 1920×1080.
     `fast` there takes 1.07 times the CPU time with files (two runs), and 1.18 times where freed memory is returned too.
     The result is the same for the same arguments, on every machine. `stages` are those that may run on some frame,
     `network` maps height and width to the bytes that a network takes while it runs, `first_network` to those of one
-    that makes a first pass; with `filters_guides` the guides of
-    frames are filtered for a network. Raises ValueError, with what is needed, if not even the fewest rows fit.
+    that makes a first pass; with `filters_guides` the guides of frames are filtered for a network. Raises ValueError,
+    with the least memory, if not even the fewest rows fit.
 
     Counted in planes of one float32 a pixel: planes kept for a window, and the most that exist at once while a frame is
     prepared, finished or worked on. `tests/reliability/test_memory.py` measures the true peak.
@@ -117,9 +117,9 @@ def plan_memory(
         working += min(oidn, CODE)  # a first pass is made while frames are prepared
         cleaning = CLEANING if filters_guides else 0
         # With frames in memory the final stage takes more than a first pass.
-        made = plane * PASSING + first_network(shot.shape) if in_files else 0
+        first_passes = plane * PASSING + first_network(shot.shape) if in_files else 0
         working *= PIECES if rows < height else 1
-        at_once = max(plane * passing + oidn, made, plane * cleaning, plane * FINISHING, working)
+        at_once = max(plane * passing + oidn, first_passes, plane * cleaning, plane * FINISHING, working)
         held += beside if background else 0.0
         held += FREED if in_files and not trims else 0.0
         return base + round(max(plane * held + at_once, plane * VALIDATING))

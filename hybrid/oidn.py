@@ -57,7 +57,7 @@ def why_no_oidn() -> str | None:
     try:
         _device("cpu")
     except ImportError as error:
-        # The package may be there, and not what it imports.
+        # The package may be there, and its imports not.
         return "pyoidn is not installed" if isinstance(error.__cause__, ModuleNotFoundError) else f"pyoidn: {error}"
     except (OSError, RuntimeError, AttributeError) as error:  # the library is not there, is another's, or has no device
         return f"pyoidn does not work here: {' '.join(str(error).split())[:200]}"
@@ -134,8 +134,8 @@ def find_device(name: str) -> str:
     for kind in [kind for kind in DEVICES if kind != "metal"] if name == "auto" else [name]:
         if _has_device(kind):
             return kind
-    there = [kind for kind in DEVICES if _has_device(kind)]
-    raise ValueError(f"device is {name!r}, expected one that OIDN can use here: auto, {', '.join(there)}")
+    devices = [kind for kind in DEVICES if _has_device(kind)]
+    raise ValueError(f"device is {name!r}, expected one that OIDN can use here: auto, {', '.join(devices)}")
 
 
 def _has_device(kind: str) -> bool:

@@ -9,10 +9,10 @@ TEXTS: dict[str, Any] = tomllib.loads((files("hybrid") / "options.toml").read_te
 
 def option_texts(command: str) -> dict[str, dict[str, Any]]:
     """Return the settings of each option that a command may have, by parameter: panel, help, and others of typer's."""
-    found = {}
+    texts = {}
     for table in (TEXTS["shared"], TEXTS.get(command, {})):
         for panel, entries in table.items():
             for name, entry in entries.items():
                 settings = {"help": entry} if isinstance(entry, str) else entry
-                found[name] = {"panel": panel, **settings}
-    return found
+                texts[name] = {"panel": panel, **settings}
+    return texts

@@ -46,15 +46,15 @@ def classify_passes(frames: Sequence[Frame]) -> tuple[Passes, dict[str, str]]:
         if frames[0].aovs[name].shape == frames[0].color.shape
     }
     sums = list(_find_all(lights, color, exposure))
-    parts = {name for found in sums for name in found.parts}
-    complete = any(found.whole == BEAUTY for found in sums)
-    words = {name: _part_of(found, name) for found in sums for name in found.parts}
+    parts = {name for total in sums for name in total.parts}
+    complete = any(total.whole == BEAUTY for total in sums)
+    reasons = {name: _part_of(total, name) for total in sums for name in total.parts}
     kept, textured = list[str](), list[str]()
     for name in names:
         layers = [frame.aovs[name] for frame in frames]
         if name not in parts and not any(map(is_noisy, layers)):
             kept.append(name)
-            words[name] = "kept: it has no noise, and is no part of the beauty"
+            reasons[name] = "kept: it has no noise, and is no part of the beauty"
             continue
         albedos = [frame.albedo for frame in frames if frame.albedo is not None]
         has_color = any(name in frame.pass_colors for frame in frames)
@@ -62,20 +62,20 @@ def classify_passes(frames: Sequence[Frame]) -> tuple[Passes, dict[str, str]]:
             textured.append(name)
         if name in parts:
             continue
-        words[name] = "denoised separately: no set of AOVs with it adds up to the beauty"
+        reasons[name] = "denoised separately: no set of AOVs with it adds up to the beauty"
         if name not in lights:
-            words[name] = f"denoised separately: it has {layers[0].shape[-1]} channels, the beauty 3"
+            reasons[name] = f"denoised separately: it has {layers[0].shape[-1]} channels, the beauty 3"
         elif not few_differ(share := share_outside(lights[name], color, exposure)):
-            words[name] = f"denoised separately: it is above the beauty, or negative, in {share:.0%} of the picture"
+            reasons[name] = f"denoised separately: it is above the beauty, or negative, in {share:.0%} of the picture"
         elif complete:
-            words[name] = "denoised separately: the beauty is the sum of other AOVs"
+            reasons[name] = "denoised separately: the beauty is the sum of other AOVs"
         elif all(shares_noise(_radiance_of(frame, name), frame.color) for frame in frames):
             sums.append(Sum(BEAUTY, (name,), complete=False))
-            words[name] = "part of the beauty, the rest of which is in no AOV: its share of the denoised beauty"
+            reasons[name] = "part of the beauty, the rest of which is in no AOV: its share of the denoised beauty"
     level = float(color.mean(dtype=np.float64))
     light = sum(float(lights[name].mean(dtype=np.float64)) for name in lights if name not in kept)
     passes = Passes(tuple(sums), tuple(textured), tuple(kept), light / level if level > 0 else 0.0)
-    return passes, {name: words[name] for name in names}
+    return passes, {name: reasons[name] for name in names}
 
 
 def _radiance_of(frame: Frame, name: str) -> Array:
@@ -96,15 +96,15 @@ def _find_all(lights: dict[str, Array], color: Array, exposure: float) -> Iterat
             others = [other for other in left if other != name]
             level = exposure if name == BEAUTY else measure_exposure(whole)
             for chosen in find_sums([left[other] for other in others], whole, level):
-                found = Sum(name, tuple(others[k] for k in chosen))
-                yield found
-                parts |= {part: left.pop(part) for part in found.parts}
+                total = Sum(name, tuple(others[k] for k in chosen))
+                yield total
+                parts |= {part: left.pop(part) for part in total.parts}
         wholes = parts
 
 
-def _part_of(found: Sum, name: str) -> str:
-    whole = "the beauty" if found.whole == BEAUTY else f"aov {found.whole}"
-    if len(found.parts) == 1:
+def _part_of(total: Sum, name: str) -> str:
+    whole = "the beauty" if total.whole == BEAUTY else f"aov {total.whole}"
+    if len(total.parts) == 1:
         return f"equal to {whole}: denoised like it"
-    others = ", ".join(part for part in found.parts if part != name)
+    others = ", ".join(part for part in total.parts if part != name)
     return f"part of {whole}, with {others}: its share of the denoised sum"

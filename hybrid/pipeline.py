@@ -23,7 +23,7 @@ from hybrid.stream import FirstPass, FrameStream
 from hybrid.validation import find_nonfinite
 
 BESIDE = "ravg/beside"  # in a header: the frames whose pictures were averaged with this one's
-# From a frame's number to the files that it was made from, by what they are.
+# From a frame's number to the files that it was made from, by their kinds.
 SourcesOf = Callable[[int], dict[str, Source]]
 
 
@@ -37,7 +37,7 @@ class Failed:
 
 @dataclass(frozen=True)
 class Finished:
-    """A frame that has been written, and what there is to say of it."""
+    """A frame that has been written, with figures of it."""
 
     number: int
     path: Path
@@ -67,7 +67,7 @@ class RunSettings:
     """How frames are read, denoised and written; none of it changes a pixel."""
 
     rows: int | None = None  # how many rows of a frame to work on at a time (`hybrid.memory.plan_memory`); None for all
-    in_files: bool = False  # whether what is kept for later windows lies in temporary files
+    in_files: bool = False  # whether the values that later windows read lie in temporary files
     trims: bool = False  # whether freed memory is returned to the system before stages that take much of it
     # whether to read and write in the background, which takes the memory of one frame read and one written
     background: bool = True
@@ -113,20 +113,20 @@ def denoise_frames(
         frames = _ShotDenoiser(views, denoise, rules, settings, radius, strength, reader, timings)
         following = dict(pairwise(shot.numbers))
         for number, path in paths.items():
-            made: Finished | Failed | Callable[[], Finished]
+            result: Finished | Failed | Callable[[], Finished]
             try:
-                made = frames.make(number, path, following.get(number))
+                result = frames.make(number, path, following.get(number))
             except (Exception, KeyboardInterrupt) as error:
                 if not settings.keep_going or not isinstance(error, ValueError | OSError):
                     yield from writer.finish()  # the frame before is complete all the same
                     raise
-                made = Failed(number, error)
+                result = Failed(number, error)
             done = writer.finish()
-            if callable(made):
-                writer.start(number, made)
+            if callable(result):
+                writer.start(number, result)
             else:
-                done.append(made)
-            del made  # or the result would still be there while the next window is denoised
+                done.append(result)
+            del result  # or the result would still be there while the next window is denoised
             yield from done if settings.background else (*done, *writer.finish())
         yield from writer.finish()
 

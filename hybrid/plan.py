@@ -110,7 +110,7 @@ class Plan:
 class Rules:
     """The stages that the user has forced; ValueError for one that does not exist, or is both on and off."""
 
-    # stages that run, or do not, whatever was measured
+    # stages that run, or do not, without regard to the figures
     on: frozenset[str] = frozenset()
     off: frozenset[str] = frozenset()
 
@@ -145,7 +145,7 @@ class Rules:
         return replace(measured, decisions=tuple(self._applied(d, pairs, context) for d in measured.decisions))
 
     def _applied(self, decision: Decision, pairs: Sequence[PairFacts], context: Context) -> Decision:
-        """A decision under what is forced, in this window."""
+        """A decision with the forced stages applied, in this window."""
         stage, on, reason = decision.stage, decision.on, decision.reason
         vectors = bool(pairs) and all(pair.vectors for pair in pairs)
         # Forcing warp on a shot without vectors implies dense flow.
@@ -159,8 +159,8 @@ class Rules:
             on, reason = False, f"the averaging of denoised frames bounds what single samples add; {reason}"
         if stage == "refine" and context.first_pass and on and not forced:
             # On forty shots and levels `balanced` loses 0.03 dB by it, and `quality` gains 0.01; a sixth of the time.
-            words = "denoised frames that vectors misplace do not count (forced, it corrects vectors that are off)"
-            on, reason = False, f"{words}; {reason}"
+            why = "denoised frames that vectors misplace do not count (forced, it corrects vectors that are off)"
+            on, reason = False, f"{why}; {reason}"
         if stage == "drift" and on and (not context.first_pass or context.radius < 2):
             on, reason = False, f"needs denoised frames, and windows of five or more; {reason}"
         if stage == "clean-guides" and on and not context.filters_guides:
@@ -238,8 +238,8 @@ def merge(plans: Mapping[int, Plan]) -> Plan:
     return Plan(tuple(merged), tuple(sorted(cuts)), tuple(sorted(repeats)))
 
 
-def _decide(stage: str, figure: float, threshold: float, words: str) -> Decision:
-    return Decision(stage, figure > threshold, figure, threshold, words.format(figure))
+def _decide(stage: str, figure: float, threshold: float, reason: str) -> Decision:
+    return Decision(stage, figure > threshold, figure, threshold, reason.format(figure))
 
 
 def _switch(stage: str, on: bool, reason: str) -> Decision:
@@ -247,10 +247,10 @@ def _switch(stage: str, on: bool, reason: str) -> Decision:
 
 
 def _decide_whiten(correlations: Sequence[Correlation | None]) -> Decision:
-    known = [(min(lags[0] for lags in c), float(np.mean([lags[2:] for lags in c]))) for c in correlations if c]
-    if not known:
+    figures = [(min(lags[0] for lags in c), float(np.mean([lags[2:] for lags in c]))) for c in correlations if c]
+    if not figures:
         return Decision("whiten", False, None, WHITEN_ABOVE, "no two neighbouring frames whose noise can be compared")
-    near, far = max(known, key=lambda figures: (figures[1] < WHITEN_BELOW, figures[0]))
+    near, far = max(figures, key=lambda pair: (pair[1] < WHITEN_BELOW, pair[0]))
     decision = _decide("whiten", near, WHITEN_ABOVE, "the noise of neighbouring pixels correlates by {:.2f}")
     if not decision.on or far < WHITEN_BELOW:
         return decision
@@ -262,20 +262,20 @@ def _decide_warp(pairs: Sequence[PairFacts], vectors: bool, moves: bool, speed: 
     if not pairs:
         return Decision("warp", False, None, STILL, "no two neighbouring frames")
     if vectors:
-        words = "the fastest thousandth moves {:.2f} px per frame" if moves else "nothing moves: at most {:.3f} px"
-        return Decision("warp", moves, speed, STILL, words.format(speed))
-    words = "{:.2%} of the picture changes between frames" if moves else "nothing changes between frames but {:.2%}"
-    return Decision("warp", moves, changed, GATE_ABOVE, words.format(changed))
+        reason = "the fastest thousandth moves {:.2f} px per frame" if moves else "nothing moves: at most {:.3f} px"
+        return Decision("warp", moves, speed, STILL, reason.format(speed))
+    reason = "{:.2%} of the picture changes between frames" if moves else "nothing changes between frames but {:.2%}"
+    return Decision("warp", moves, changed, GATE_ABOVE, reason.format(changed))
 
 
 def _decide_dense_flow(pairs: Sequence[PairFacts], vectors: bool, moves: bool) -> Decision:
     if moves and not vectors:
-        words = "no motion vectors in the file: the motion has to be found in the pictures"
+        reason = "no motion vectors in the file: the motion has to be found in the pictures"
     elif vectors:
-        words = "motion vectors are there"
+        reason = "motion vectors are there"
     else:
-        words = "nothing moves" if pairs else "no two neighbouring frames"
-    return Decision("dense-flow", moves and not vectors, None, 0, words)
+        reason = "nothing moves" if pairs else "no two neighbouring frames"
+    return Decision("dense-flow", moves and not vectors, None, 0, reason)
 
 
 def _decide_refine(moves: bool, vectors: bool, unexplained: float) -> Decision:
@@ -290,21 +290,21 @@ def _decide_fixed_noise(figures: Sequence[float]) -> Decision:
     if not figures:
         return Decision("fixed-noise", False, None, FIXED_NOISE_ABOVE, "no two neighbouring frames")
     figure = float(np.median(figures))
-    words = "{:.2f} of the noise of neighbouring frames is the same at equal pixels"
+    reason = "{:.2f} of the noise of neighbouring frames is the same at equal pixels"
     if figure > FIXED_NOISE_ABOVE:
-        words += ": the render has one seed for all frames, and time adds little where nothing moves; in Blender, "
-        words += "switch on Render > Sampling > Advanced > Animate Seed (the clock beside Seed)"
-    return _decide("fixed-noise", figure, FIXED_NOISE_ABOVE, words)
+        reason += ": the render has one seed for all frames, and time adds little where nothing moves; in Blender, "
+        reason += "switch on Render > Sampling > Advanced > Animate Seed (the clock beside Seed)"
+    return _decide("fixed-noise", figure, FIXED_NOISE_ABOVE, reason)
 
 
 def _decide_prefilter(grain: Sequence[float], noise: Iterable[float], unknown: bool) -> Decision:
     if not grain:
         return Decision("prefilter", False, None, GUIDE_NOISE_ABOVE, "no guides in the file")
-    figure, words = max(noise, default=0.0), "the guides differ by {:.3f} between frames"
+    figure, reason = max(noise, default=0.0), "the guides differ by {:.3f} between frames"
     if figure == 0 and unknown:
         figure = max(grain)
-        words = "the guides differ by {:.3f} from pixel to pixel, and not at all between frames"
-    return _decide("prefilter", figure, GUIDE_NOISE_ABOVE, words)
+        reason = "the guides differ by {:.3f} from pixel to pixel, and not at all between frames"
+    return _decide("prefilter", figure, GUIDE_NOISE_ABOVE, reason)
 
 
 def _decide_clean_guides(
@@ -314,13 +314,13 @@ def _decide_clean_guides(
         return replace(prefilter, stage="clean-guides")
     if noise is None:
         # Filtering costs at most 0.02 dB where guides have no noise, and gains 1.3 dB where they are of 8 samples.
-        words = "the noise of the guides at outlines is unknown: no motion vectors of whole pixels"
-        known = [count for count in samples if count is not None]
-        if len(known) < len(samples):
-            return Decision("clean-guides", True, None, OUTLINE_NOISE_ABOVE, words)
+        reason = "the noise of the guides at outlines is unknown: no motion vectors of whole pixels"
+        counts = [count for count in samples if count is not None]
+        if len(counts) < len(samples):
+            return Decision("clean-guides", True, None, OUTLINE_NOISE_ABOVE, reason)
         # A pixel that an outline divides in halves has this variance, over that of its surroundings.
         return _decide(
-            "clean-guides", 1 / min(known), OUTLINE_NOISE_ABOVE, f"{words}; {{:.3f}} by the samples per pixel"
+            "clean-guides", 1 / min(counts), OUTLINE_NOISE_ABOVE, f"{reason}; {{:.3f}} by the samples per pixel"
         )
     return _decide(
         "clean-guides", max(noise), OUTLINE_NOISE_ABOVE, "{:.3f} of the variance of the guides at outlines is noise"

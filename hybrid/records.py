@@ -130,8 +130,8 @@ def read_records(folder: Path, name: str | None = None) -> Iterator[tuple[Path, 
     paths = sorted((folder / FOLDER).glob("*.json")) if (folder / FOLDER).is_dir() else []
     if name is not None:
         paths = [path for path in paths if _sequence_of(path) == (name or NAMELESS)]
-    found = [(path, document) for path in paths if (document := _read(path)) is not None]
-    yield from sorted(found, key=lambda item: item[1]["started"])
+    records = [(path, document) for path in paths if (document := _read(path)) is not None]
+    yield from sorted(records, key=lambda item: item[1]["started"])
 
 
 def recorded_sequences(folder: Path) -> list[str]:

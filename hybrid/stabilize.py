@@ -56,7 +56,7 @@ class Excess(NamedTuple):
     """By how much a frame as rendered exceeds its picture, where it does so by much."""
 
     bright: Mask  # (H, W): the bright pixels (`nlm.moving_lights.find_bright`)
-    values: Array  # (K,): the excess at these, relative to what is exceeded plus the exposure
+    values: Array  # (K,): the excess at these, relative to the picture plus the exposure
 
     @classmethod
     def of(cls, relative: Array) -> Self:
@@ -74,7 +74,7 @@ class Excess(NamedTuple):
 
 @dataclass(frozen=True)
 class WindowResult:
-    """A window denoised, with what the averaging of neighbouring results reads."""
+    """A denoised window, with the figures for averaging it with neighbouring results."""
 
     denoised: Denoised  # the centre
     plan: Plan  # the stages that ran on the window
@@ -89,7 +89,7 @@ class WindowResult:
     outliers: int  # rejected in the window
 
     def as_neighbour(self) -> Self:
-        """The result without what only the average of its own frame reads."""
+        """The result without the fields that only the average of its own frame reads."""
         alone = Denoised(self.denoised.color)
         return replace(self, denoised=alone, neighbour_samples=None, geometry=(), drift_weight=None)
 
@@ -144,7 +144,7 @@ class FrameDenoiser:
     def make(self, number: int) -> FrameResult:
         """Denoise a frame; ValueError or OSError if it, or a neighbour, fails, or its light is not the samples'."""
         averaged = self.neighbours(number)
-        # The frame before keeps only what the average reads.
+        # The result of the frame before keeps only the fields that the average reads.
         self._results = {n: _needed(result, n >= number) for n, result in self._results.items() if n in averaged}
         for n in averaged:
             if n not in self._results or (n == number and not self._results[n].geometry):
@@ -154,35 +154,34 @@ class FrameDenoiser:
                 except (ValueError, OSError):
                     if n == number or not self.keep_going:
                         raise
-        result = self._results[number]
-        denoised, beyond = result.denoised, 0
+        result, frame = self._results[number], self.stream.frame(number)
+        assert frame is not None
+        denoised = result.denoised
         if "stabilize" in result.plan.stages and len(self._results) > 1:
             denoised = self._stabilize(number)
-        frame = self.stream.frame(number)
-        if frame is not None:
-            if frame.valid.any() and not frame.radiance.any():
-                # Before it counts as a fault: what leaks into black between lit frames is no more than an error.
-                denoised = _changed(denoised, np.zeros_like(denoised.color), CORRECTED)
-            self._check_light(denoised.color, frame, result.brightest)
-            moving = self._moving_lights(frame) if "blend-samples" in result.plan.stages else None
-            denoised = self._correct(denoised, frame, result, moving)
-            if frame.highlights is not None:
-                denoised = _with_highlights(denoised, frame.highlights)
-            if frame.spread is not None:
-                denoised = _with_filter(denoised, frame)
-            denoised, beyond = _with_unfiltered(denoised, frame), frame.unfiltered.count
-            if self.strength < 1:
-                denoised = _with_noise(denoised, self.stream.shot.read(number), 1 - self.strength)
+        if frame.valid.any() and not frame.radiance.any():
+            # Light that leaks into a black frame between lit ones is a small error, and no fault.
+            denoised = _changed(denoised, np.zeros_like(denoised.color), CORRECTED)
+        self._check_light(denoised.color, frame, result.brightest)
+        moving = self._moving_lights(frame) if "blend-samples" in result.plan.stages else None
+        denoised = self._correct(denoised, frame, result, moving)
+        if frame.highlights is not None:
+            denoised = _with_highlights(denoised, frame.highlights)
+        if frame.spread is not None:
+            denoised = _with_filter(denoised, frame)
+        denoised = _with_unfiltered(denoised, frame)
+        if self.strength < 1:
+            denoised = _with_noise(denoised, self.stream.shot.read(number), 1 - self.strength)
         return FrameResult(
             denoised,
             result.plan,
             tuple(sorted(self._results)),
-            0.0 if frame is None else frame.mean,
-            0.0 if frame is None else frame.removed_radiance,
-            0 if frame is None else frame.repaired,
-            0 if frame is None else frame.fireflies,
+            frame.mean,
+            frame.removed_radiance,
+            frame.repaired,
+            frame.fireflies,
             result.outliers,
-            beyond,
+            frame.unfiltered.count,
         )
 
     def neighbours(self, number: int) -> list[int]:
@@ -196,8 +195,8 @@ class FrameDenoiser:
         assert window is not None
         plan = stream.plan(numbers, stream.context(window.first_pass is not None, stream.radius))
         brightest = 0.0
-        for there in window.frames:
-            brightest = brightest if there is None else max(brightest, there.mean)
+        for frame in window.frames:
+            brightest = brightest if frame is None else max(brightest, frame.mean)
             stream.keeper.release()  # a mean reads the whole frame
         exposure, bands = window.lit.as_rendered.exposure, self._bands()
         shares = {"refine": float(np.mean(window.refined))} if window.refined else {}
@@ -228,14 +227,15 @@ class FrameDenoiser:
         samples = layers.named("sides")
         color = layers.named("color")[""]
         frame, excess, passing = stream.frame(number), None, None
-        if "blend-samples" in plan.stages and frame is not None:
+        if "blend-samples" in plan.stages:
+            assert frame is not None
             with stream.timings.stage("blend-samples"):
                 excess, passing = _excess(frame, color, SampleMean(**samples) if samples else None)
         return WindowResult(
             Denoised(color, layers.named("aovs"), layers.named("extra"), parts),
             replace(plan, shares=shares),
             SampleMean(**samples) if samples else None,
-            tuple(Geometry(**found) if (found := layers.named(side)) else None for side in NEIGHBOURS),
+            tuple(Geometry(**geometry) if (geometry := layers.named(side)) else None for side in NEIGHBOURS),
             layers.named("drift").get(""),
             exposure,
             brightest,
@@ -285,7 +285,7 @@ class FrameDenoiser:
             with timings.stage("restore-mean"):
                 # An error beside a lamp stays there: spread over a room, a halo of 60 pixels darkened it by 1 %.
                 far = counted & ~beside_lamps(color, exposure)
-                # First without fireflies: a mean of few bright samples is not known, that of all others is.
+                # First without fireflies: the mean of few bright samples is uncertain, that of all others is not.
                 for noisy in (radiance, rendered) if frame.removed_samples else (rendered,):
                     color = restore_mean(color, _where(far, noisy, color), exposure)
         if sides is not None:
@@ -310,9 +310,9 @@ class FrameDenoiser:
             seen, trail = self._lights_beyond_picture(number, others), np.zeros(self.stream.shot.shape, bool)
             own, passing = self._results[number].passing, {}
             for time in (-1, 1):
-                there = self._passing_of(number + time * step, number)
-                if there is not None:
-                    passing[time] = there.layers, self._vectors(number, number + time * step)
+                excess = self._passing_of(number + time * step, number)
+                if excess is not None:
+                    passing[time] = excess.layers, self._vectors(number, number + time * step)
             if own is not None and passing:
                 lights, (down, right) = passing_lights(*own.layers, passing)
                 seen = seen | lights
@@ -344,11 +344,11 @@ class FrameDenoiser:
         """The excess of a neighbour: over the frame's own result where a classical preset has no other."""
         if "stabilize" in self.stream.rules.allowed:
             return self._results[number].excess if number in self._results else None
-        there, flow = self.stream.frame(number), self.stream.flow(number, beside)
-        if there is None or flow is None:
+        neighbour, flow = self.stream.frame(number), self.stream.flow(number, beside)
+        if neighbour is None or flow is None:
             return None
         picture, shown = warp(self._results[beside].denoised.color, flow.vectors)
-        return _excess(there, picture, inside=shown)[0]
+        return _excess(neighbour, picture, inside=shown)[0]
 
     def _passing_of(self, number: int, beside: int) -> Excess | None:
         """The excess of a neighbour over its neighbours' samples too, or else as `_excess_of`."""
@@ -386,7 +386,7 @@ class _Layers:
 
 
 def _needed(result: WindowResult, whole: bool) -> WindowResult:
-    """The whole result, or what only the average with another frame's reads."""
+    """The whole result, or the part that the average with another frame reads."""
     return result if whole else result.as_neighbour()
 
 
@@ -421,8 +421,13 @@ def _changed(denoised: Denoised, color: Array, most: float = MOST) -> Denoised:
     if most > MOST and not denoised.parts:
         return replace(denoised, color=color)
     color, change = limit_change(own, color, most, with_factor=bool(denoised.parts))
+    return _with_parts(denoised, color, change)
+
+
+def _with_parts(denoised: Denoised, color: Array, factor: Array) -> Denoised:
+    """The picture with another color, and its parts times a factor."""
     aovs, extra = (
-        {name: layer * change if name in denoised.parts else layer for name, layer in layers.items()}
+        {name: layer * factor if name in denoised.parts else layer for name, layer in layers.items()}
         for layers in (denoised.aovs, denoised.extra)
     )
     return replace(denoised, color=color, aovs=aovs, extra=extra)
@@ -432,11 +437,7 @@ def _with_highlights(denoised: Denoised, highlights: Highlights) -> Denoised:
     """Add persistent highlights to the picture, and scale its parts alike."""
     color = add_highlights(denoised.color, highlights)
     ratio = np.divide(color, denoised.color, out=np.ones_like(color), where=denoised.color > 0)
-    aovs, extra = (
-        {name: layer * ratio if name in denoised.parts else layer for name, layer in layers.items()}
-        for layers in (denoised.aovs, denoised.extra)
-    )
-    return replace(denoised, color=color, aovs=aovs, extra=extra)
+    return _with_parts(denoised, color, ratio)
 
 
 def _with_filter(denoised: Denoised, frame: PreparedFrame) -> Denoised:
@@ -447,7 +448,7 @@ def _with_filter(denoised: Denoised, frame: PreparedFrame) -> Denoised:
 
 
 def _with_unfiltered(denoised: Denoised, frame: PreparedFrame) -> Denoised:
-    """The picture and its parts with what no filter took (`hybrid.alignment.unfiltered`)."""
+    """Restore the unfiltered light in the picture and its parts (`hybrid.alignment.unfiltered`)."""
     unfiltered, aovs = frame.unfiltered, dict(denoised.aovs)
     for name in aovs.keys() & unfiltered.gray:
         # Parts of a colored light add up to it, with the tint that their shares of it have.
@@ -463,7 +464,7 @@ def _with_unfiltered(denoised: Denoised, frame: PreparedFrame) -> Denoised:
 
 
 def _with_noise(denoised: Denoised, rendered: Frame, share: float) -> Denoised:
-    """The layers with a share of the frame's noise; where it holds NaN or infinities they stay as they are."""
+    """Blend a share of the frame's noise into the layers; not where the frame is not finite."""
 
     def blend(layer: Array, noisy: Array) -> Array:
         noisy = noisy.reshape(layer.shape)

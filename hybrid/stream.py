@@ -1,4 +1,4 @@
-"""The frames of a shot in memory, and everything that is made of each once, while windows slide over them.
+"""The frames of a shot in memory, and the values computed from each once, while windows slide over them.
 
 `FrameStream` alone owns it: each value is made when first read, and dropped with one of the frames it belongs to.
 """
@@ -69,7 +69,7 @@ class FirstPass:
 
 
 class FrameStream:
-    """The frames of a shot, read lazily, and what is made of each; `radius` of windows, `refine` as `refine_flow`.
+    """The frames of a shot, read lazily, and the values computed from each, once; `refine` as `refine_flow`.
 
     `filter_guides` maps a frame's albedo and normal to the same without noise, for denoisers that need them.
     """
@@ -117,7 +117,7 @@ class FrameStream:
         return list(range(number - radius * step, number + radius * step + 1, step))
 
     def neighbours(self, number: int) -> list[int]:
-        """The frame and those beside it that are there, with a picture where the first pass is read from files."""
+        """The frame and its neighbours that exist; where the first pass is read from files, those with a picture."""
         files = None if self.source is None else self.source.files
         return [n for n in self.around(number, 1) if self.shot.has(n) and (files is None or files.has(n))]
 
@@ -158,10 +158,10 @@ class FrameStream:
         return denoised
 
     def measurements(self, numbers: Sequence[int]) -> tuple[list[FrameFacts], list[PairFacts]]:
-        """Figures of those of these frames that are there, and of their neighbouring pairs."""
-        there = [n for n in numbers if self.shot.has(n)]
-        pairs = [(a, b) for a, b in pairwise(there) if b - a == self.shot.step]
-        return [self._facts(n) for n in there], [self._pair_facts(a, b) for a, b in pairs]
+        """Measure the frames of these that exist, and their neighbouring pairs."""
+        present = [n for n in numbers if self.shot.has(n)]
+        pairs = [(a, b) for a, b in pairwise(present) if b - a == self.shot.step]
+        return [self._facts(n) for n in present], [self._pair_facts(a, b) for a, b in pairs]
 
     def plan(self, numbers: Sequence[int], context: Context = NOISY) -> Plan:
         """Decide which stages run on these frames."""
@@ -196,8 +196,8 @@ class FrameStream:
         window = self._collect(number, numbers, frames, denoised if with_first_pass else None)
         if not with_first_pass:
             return window
-        found = [(self._limited(n), np.mean(self._fade(n, number, window.stages), dtype=np.float32)) for n in numbers]
-        limited = (part and part._replace(exposure=part.exposure * fade) for part, fade in found)
+        limits = [(self._limited(n), np.mean(self._fade(n, number, window.stages), dtype=np.float32)) for n in numbers]
+        limited = (part and part._replace(exposure=part.exposure * fade) for part, fade in limits)
         return replace(window, limited=tuple(limited), filtered_guides=self._filtered(numbers, window.stages))
 
     def window_of_results(self, number: int, results: dict[int, Array]) -> Window:
@@ -228,20 +228,18 @@ class FrameStream:
         plan = self.plan(numbers, self.context(denoised is not None, middle))
         forth: dict[int, Flow | None] = {}
         back: dict[int, Flow | None] = {}
-        samples = {number: 1.0}
+        samples, own_samples = {number: 1.0}, {number: 1.0}
         for side in (numbers[middle + 1 :], numbers[:middle][::-1]):
             before = number
             for n in side:
                 forth[n] = self._composed(forth, number, before, n)
                 back[n] = self._composed(back, number, before, n, reverse=True)
                 samples[n] = samples[before] * self._samples_beside(before, n)
+                own_samples[n] = 0.0 if self._repeats(before, n) else min(samples[n], 1.0)
                 before = n
         links = tuple(_link(forth.get(n), back.get(n)) for n in numbers)
         steps = [self._cache.get(("flows", pair)) for pair in pairwise(numbers)]
         refined = [share for step in steps if step is not None for share in cast(PairFlows, step).refined]
-        repeated = tuple(
-            n != number and self._repeats(n, n + (self.shot.step if n < number else -self.shot.step)) for n in numbers
-        )
         fades = [self._fade(n, number, plan.stages) for n in numbers]
         centre = self._there(number)
         frames = tuple(
@@ -258,8 +256,7 @@ class FrameStream:
             links,
             denoised,
             plan.stages,
-            repeated,
-            tuple(np.float32(min(samples[n], 1)) for n in numbers),
+            tuple(np.float32(own_samples[n]) for n in numbers),
             tuple(refined),
             noise,
             release=self.keeper.release,
@@ -277,7 +274,7 @@ class FrameStream:
         return self.keeper.keep(composed)
 
     def _samples_beside(self, before: int, number: int) -> float:
-        """The samples of a frame over those of the one beside it; 1 where one of them is missing."""
+        """Ratio of the samples of a frame to those of its neighbour; 1 where one of them is missing."""
         earlier, later = sorted((before, number))
         if not (self.shot.has(earlier) and self.shot.has(later)):
             return 1.0
@@ -392,8 +389,8 @@ class FrameStream:
             with self.timings.stage("clean-guides"):
                 return {n: g.astype(np.float16) for n, g in run(guides).items()} if guides else None
 
-        found = tuple(self._cached("filtered guides", (n,), make) for n in numbers)
-        return None if found[len(found) // 2] is None else found
+        filtered = tuple(self._cached("filtered guides", (n,), make) for n in numbers)
+        return None if filtered[len(filtered) // 2] is None else filtered
 
     def _limited(self, number: int) -> Limited | None:
         """The light that the limit of residuals takes from a frame; None if that is little, or without a first pass."""
@@ -431,11 +428,11 @@ class FrameStream:
         if facts.cut:
             return PairFlows(None, None)
         stages = plan.stages - {"warp"} if facts.repeated else plan.stages
-        here, fade = self._there(earlier), self._fade(later, earlier, stages)
-        there = self._there(later)
-        there = there if fade == NO_FADE else scaled(there, fade)
+        first, fade = self._there(earlier), self._fade(later, earlier, stages)
+        second = self._there(later)
+        second = second if fade == NO_FADE else scaled(second, fade)
         with self.timings.stage("flow"):
-            return measure_flows(here, there, stages, self._refine)
+            return measure_flows(first, second, stages, self._refine)
 
     def _there(self, number: int) -> PreparedFrame:
         frame = self.frame(number)
@@ -465,8 +462,8 @@ def _flow_planes(layers: Layers, stages: Collection[str], frames: int, radius: i
     """Count the planes of flows: two of vectors, and a byte of validity, for each pair and each composed flow."""
     if "warp" not in stages:
         return 0.0
-    made = can_refine(stages) or (layers.motion_convention is not None and not layers.motion_convention.pair)
-    steps = 2 * (frames - 1) if made else 0  # the renderer's own are kept with the frames
+    kept = can_refine(stages) or (layers.motion_convention is not None and not layers.motion_convention.pair)
+    steps = 2 * (frames - 1) if kept else 0  # the renderer's own are kept with the frames
     composed = 2 * (radius + 1) * max(radius - 1, 0)
     return (2 + 0.25) * (composed + steps)
 

@@ -193,9 +193,9 @@ def _validate_pairs(shot: Shot, pairs: Sequence[tuple[int, int]]) -> ValidationR
 
     def add_surfaces(earlier: Frame, later: Frame, roles: Collection[str]) -> list[Patches]:
         for role in roles:
-            here, there = getattr(earlier, role), getattr(later, role)
-            both = here is not None and there is not None
-            if both and (pair := _pair_of(earlier, later, here, there, shot.step)) is not None:
+            first, second = getattr(earlier, role), getattr(later, role)
+            both = first is not None and second is not None
+            if both and (pair := _pair_of(earlier, later, first, second, shot.step)) is not None:
                 surfaces.append(Patches(replace(pair, lift=float(role == "normal"))))
                 keeper.release()
         return surfaces
@@ -212,12 +212,12 @@ def _validate_pairs(shot: Shot, pairs: Sequence[tuple[int, int]]) -> ValidationR
     return checks.with_passes(report)
 
 
-def _pair_of(earlier: Frame, later: Frame, here: Array, there: Array, step: int) -> FramePair | None:
+def _pair_of(earlier: Frame, later: Frame, first: Array, second: Array, step: int) -> FramePair | None:
     """Pictures of two frames with their vectors; None if a frame has no vectors."""
     if earlier.motion is None or later.motion is None:
         return None
     resolution = earlier.resolution or earlier.motion.shape[:2]
-    return FramePair(here, there, earlier.motion, later.motion, resolution, step)
+    return FramePair(first, second, earlier.motion, later.motion, resolution, step)
 
 
 def _pair_numbers(shot: Shot) -> list[tuple[int, int]]:
@@ -282,9 +282,9 @@ class _Checks:
         findings = [*variance_findings, *grade_findings]
         blacks = [black for black in self.log_blacks if black is not None]
         if blacks and len(blacks) == len(self.log_blacks):
-            words = f"looks encoded by a log curve (black is {blacks[0]:.3f}, nothing is above {LOG_WHITE:g}): averages"
-            words += " of it are too dark; write scene-linear color, or convert it (oiiotool --colorconvert)"
-            findings.append(Finding("color", f"{self._name('color')} {words}", left_out=False))
+            fault = f"looks encoded by a log curve (black is {blacks[0]:.3f}, nothing is above {LOG_WHITE:g}): averages"
+            fault += " of it are too dark; write scene-linear color, or convert it (oiiotool --colorconvert)"
+            findings.append(Finding("color", f"{self._name('color')} {fault}", left_out=False))
         for role, messages in self.wrong.items():
             if all(messages):
                 findings.append(self._leave_out(role, str(messages[0])))
@@ -304,8 +304,10 @@ class _Checks:
         """Add how the AOVs add up to the beauty, with one line for each."""
         if not self.passes:
             return report
-        passes, words = classify_passes(self.passes)
-        lines = (Finding("aov", f"aov {name}: {said}", warning=False, left_out=False) for name, said in words.items())
+        passes, reasons = classify_passes(self.passes)
+        lines = (
+            Finding("aov", f"aov {name}: {reason}", warning=False, left_out=False) for name, reason in reasons.items()
+        )
         return replace(report, findings=(*report.findings, *lines), passes=passes)
 
     def _scale_variance(self) -> tuple[float | None, list[Finding]]:
@@ -316,13 +318,13 @@ class _Checks:
         said = f"is {ratio:.3g} times that of the picture"
         if 1 / VARIANCE <= ratio <= VARIANCE:
             return None, []
-        samples, known = self.layers.samples, self.layers.variance_scale is not None
-        if self.layers.variance_of == "sample" and not known and ratio > 1:
-            words = f"{self._name('variance')} {said}, as the variance of samples is: divided by that"
-            return 1 / ratio, [Finding("variance", words, warning=False, left_out=False)]
+        samples, stated = self.layers.samples, self.layers.variance_scale is not None
+        if self.layers.variance_of == "sample" and not stated and ratio > 1:
+            message = f"{self._name('variance')} {said}, as the variance of samples is: divided by that"
+            return 1 / ratio, [Finding("variance", message, warning=False, left_out=False)]
         if self.layers.variance_of is None and samples and 1 / VARIANCE <= ratio / samples <= VARIANCE:
-            words = f"{self._name('variance')} {said}: read as the variance of {samples:g} samples"
-            return 1 / samples, [Finding("variance", words, left_out=False)]
+            message = f"{self._name('variance')} {said}: read as the variance of {samples:g} samples"
+            return 1 / samples, [Finding("variance", message, left_out=False)]
         return None, [self._leave_out("variance", said)]
 
     def _grade_estimate(self) -> tuple[tuple[float, float, float] | None, list[Finding]]:
@@ -331,12 +333,12 @@ class _Checks:
             return None, []
         if grade.factors is None:
             return None, [self._leave_out("estimate", grade.message)]
-        words = f"{self._name('estimate')} {grade.message}: brought to that"
-        return grade.factors, [Finding("estimate", words, left_out=False)]
+        message = f"{self._name('estimate')} {grade.message}: brought to that"
+        return grade.factors, [Finding("estimate", message, left_out=False)]
 
-    def _leave_out(self, role: str, words: str) -> Finding:
+    def _leave_out(self, role: str, fault: str) -> Finding:
         loss = ROLE_FACTS[role]["left_out"]
-        return Finding(role, f"{self._name(role)} {words}: left out, {loss}; check the pass, or --layer {role}=NAME")
+        return Finding(role, f"{self._name(role)} {fault}: left out, {loss}; check the pass, or --layer {role}=NAME")
 
     def _name(self, role: str) -> str:
         return f"{role} ({getattr(self.layers, role) or 'of two halves'})"
@@ -348,25 +350,25 @@ def _motion_findings(layers: Layers, choice: Choice) -> Iterator[Finding]:
     left, still = f"{choice.unexplained:.1%}", f"{choice.still:.1%}"
     if choice.convention is None:
         flow = "" if choice.found is None else f", optical flow {choice.found:.1%}"
-        words = f"{name}: no convention explains the pictures (the best leaves {left}, no motion {still}{flow})"
+        message = f"{name}: no convention explains the pictures (the best leaves {left}, no motion {still}{flow})"
         yield Finding(
             "motion",
-            f"{words}: left out, replaced by optical flow, slower and less exact; check the pass, or --motion WORDS",
+            f"{message}: left out, replaced by optical flow, slower and less exact; check the pass, or --motion WORDS",
         )
     elif choice.contradicted:
-        words = f"{name}: {choice.convention}, as stated, does not explain the pictures"
-        yield Finding("motion", f"{words} (it leaves {left}, no motion {still}): used as stated", left_out=False)
+        message = f"{name}: {choice.convention}, as stated, does not explain the pictures"
+        yield Finding("motion", f"{message} (it leaves {left}, no motion {still}): used as stated", left_out=False)
     elif choice.convention != layers.motion_convention:
         contradicts = any(
             getattr(choice.convention, part) != getattr(layers.motion_convention, part) for part in layers.settled
         )
         as_stated = next((t.unexplained for t in choice.trials if t.convention == layers.motion_convention), None)
         stated = "" if as_stated is None else f"{layers.motion_convention} {as_stated:.1%}, "
-        words = f"{name}: read as {choice.convention}, which leaves {left} unexplained ({stated}no motion {still})"
-        yield Finding("motion", words, warning=contradicts, left_out=False)
+        message = f"{name}: read as {choice.convention}, which leaves {left} unexplained ({stated}no motion {still})"
+        yield Finding("motion", message, warning=contradicts, left_out=False)
     elif choice.open:
-        words = f"{name}: the pictures do not determine {', '.join(choice.open)}: read as {choice.convention}"
-        yield Finding("motion", words, warning=False, left_out=False)
+        message = f"{name}: the pictures do not determine {', '.join(choice.open)}: read as {choice.convention}"
+        yield Finding("motion", message, warning=False, left_out=False)
 
 
 def _thin(frame: Frame) -> Frame:
@@ -409,10 +411,10 @@ def _edges_of(colors: Sequence[Array]) -> list[Array]:
     return [_slope(np.asarray(tone, np.float32)) for tone in tones]
 
 
-def _match_edges(found: Sequence[Array], shown: Sequence[Array]) -> _EdgeMatch:
-    """Correlate edges that were found with those of two frames; the better is the own, as dim frames match anything."""
-    centre = max(correlation(found[0], shown[0]), correlation(found[1], shown[1]))
-    return _EdgeMatch(centre, correlation(found[1], shown[0]), correlation(found[0], shown[1]))
+def _match_edges(edges: Sequence[Array], shown: Sequence[Array]) -> _EdgeMatch:
+    """Correlate edges of a layer with those of two frames; the better one is its own, as dim frames match anything."""
+    centre = max(correlation(edges[0], shown[0]), correlation(edges[1], shown[1]))
+    return _EdgeMatch(centre, correlation(edges[1], shown[0]), correlation(edges[0], shown[1]))
 
 
 def _other_frame(edges: Sequence[_EdgeMatch]) -> str | None:
@@ -438,8 +440,8 @@ def _check_guide(layer: Array) -> str | None:
 
 
 def _check_albedo(layer: Array, _: Array) -> str | None:
-    if (words := _check_guide(layer)) is not None:
-        return words
+    if (fault := _check_guide(layer)) is not None:
+        return fault
     if (below := float(np.mean(layer.min(axis=-1) < -SAME))) > STRAY:
         return f"is negative in {below:.1%} of the picture"
     if (above := float(np.mean(layer.max(axis=-1) > BRIGHT))) > 0.5:
@@ -448,8 +450,8 @@ def _check_albedo(layer: Array, _: Array) -> str | None:
 
 
 def _check_normal(layer: Array, _: Array) -> str | None:
-    if (words := _check_guide(layer)) is not None:
-        return words
+    if (fault := _check_guide(layer)) is not None:
+        return fault
     long = float(np.mean(np.einsum("yxc,yxc->yx", layer, layer) > LENGTH**2))
     return f"is longer than 1 in {long:.1%} of the picture" if long > STRAY else None
 
@@ -477,13 +479,13 @@ def _check_estimate(layer: Array, color: Array) -> str | None:
 
 
 def _equal_share(a: Array, b: Array, same: Mask) -> float:
-    """Share of the pixels that are the same, among those where either layer is not 0; 0 if there is none."""
+    """Share of equal pixels among the pixels where either layer is not 0; 0 without any."""
     lit = (a != 0) | (b != 0)
     lit = lit.any(axis=-1) if lit.ndim == 3 else lit
     return float(np.mean(same[lit])) if lit.any() else 0.0
 
 
-# Role → check of its layer and the color; returns what is wrong, or None.
+# Role → check of its layer and the color; returns the fault, or None.
 _CHECKS: dict[str, Callable[[Array, Array], str | None]] = {
     "albedo": _check_albedo,
     "normal": _check_normal,

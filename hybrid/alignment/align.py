@@ -1,8 +1,8 @@
-"""Align a window of frames to its centre (`align`, for all filters and networks), and results to each other."""
+"""Align a window of frames to its centre (`align`), and the results of three frames to each other."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,24 +33,24 @@ from nlm.pooling import SampleRange
 from nlm.relight import relight
 from nlm.samples import average_neighbours
 
-# How much of a frame's noise finished pictures may differ by: up to the first as they are, up to the second without
-# their mean difference (`nlm.relight`), where the light stands still as far as samples show (`nlm.drift`). The second
-# alone is steadier by 0.2 dB, and averages moving shadows: 2.7 dB of such a shot.
+# Scale of the gate of results, relative to a frame's noise: everywhere, and where the light stands still (`nlm.drift`)
+# and the mean difference is subtracted (`nlm.relight`). With the second alone results are steadier by 0.2 dB, and
+# moving shadows are averaged: 2.7 dB of such a shot.
 FINISHED = 0.1, 0.5
-# The same without noise, in tone-mapped units, and by how many times more single pixels may differ: without the second
-# a shot of sharp outlines loses 1 dB at 128 and 512 samples, half of it with 3; 1 costs still shots up to 8 dB in time.
+# The scale without noise, in tone-mapped units, and its factor for single pixels: without the factor a shot of sharp
+# outlines loses 1 dB at 128 and 512 samples, half of it with 3; 1 costs still shots up to 8 dB in time.
 FINISHED_FLOOR, FINISHED_DETAIL = 0.001, 2.0
-# How much more finished pictures lose by a drift than first passes do, whose errors are several times as large: 20 and
-# 100 differ by 0.05 dB, and by 0.25 dB where shadows move.
+# Drift costs results more than first passes, whose errors are several times as large, by this factor: 20 and 100 differ
+# by 0.05 dB, and by 0.25 dB where shadows move.
 DRIFTED = 100
-# Where the light of a frame drifts nearly everywhere, samples show it only in places, and the rest drifts too: finished
-# pictures count in full where two fifths of the picture stand still, and not at all where less than a fifth does. Of
-# nine validation shots one has such light, and gains 0.1 dB; one loses 0.04, the others nothing.
+# Shares of a frame that stand still: below the first its results are not averaged, from the second on they count in
+# full. Light that drifts nearly everywhere is measured only in places. One of nine validation shots has such light and
+# gains 0.1 dB; one loses 0.04, the others nothing.
 STANDING = 0.2, 0.4
 # Rows around a band that its result depends on: 23 for all filters of the classical chain together, or the receptive
-# field of a trunk (112), of the measure of drift (55) and of the gate (11). The mean of pooled samples (72) reaches
-# beyond, for 2e-7 of the light. Whole strips of the guided filter (64 rows): it then sums in the order it would in the
-# frame.
+# field of a U-Net (112), of the measure of drift (55) and of the gate (11). The mean of pooled samples (72) reaches
+# beyond, for 2e-7 of the light. A multiple of the strips of the guided filter (64 rows), whose order of sums is then
+# that of the whole frame.
 MARGIN = 192
 
 
@@ -164,8 +164,9 @@ def _align_denoised(
         pull = drift_weight = samples = known_range = None
         if "drift" in stages:
             pull = drift_weights(estimates, irradiance, confidence, exposure, first_row=rows.start)
-            # A copy: a view would keep the weights of all frames in memory.
-            drift_weight = pull[middle + 1].copy() if _shows_drift(window) else None
+            before, after = window.links[middle - 2 : middle], window.links[middle + 1 : middle + 3]
+            if None not in before or None not in after:  # two frames on one side show drift
+                drift_weight = pull[middle + 1].copy()  # a view would keep the weights of all frames in memory
         if "blend-samples" in stages:
             known_range = SampleRange.empty(irradiance.shape) if ranged else None
             strips = _pull_behind(sources.residual_strips(), estimates, confidence, pull, known_range)
@@ -217,8 +218,8 @@ def align_results(
     with timings.stage("stabilize"):
         divisor = None if centre.albedo is None or not centre.demodulated else centre.albedo[padded]
         light = results if divisor is None else demodulate(results, divisor)
-        # Outlines are as geometry has them: finished ones are sharp, and their mean over frames is not. On the
-        # bundled shot with its chrome that is worth 0.4 dB.
+        # No least confidence: outlines of results are sharp, and their mean over frames is not. It would cost the
+        # bundled shot with its chrome 0.4 dB.
         gates = color_gates(light, noisy, exposure, FINISHED, floor=FINISHED_FLOOR, detail=FINISHED_DETAIL)
         alike, confidence = (combine_confidence(confidence, coverage, gate, stages, least=0.0) for gate in gates)
         local = stillness.local[padded]
@@ -238,30 +239,28 @@ def aligned_planes(layers: Layers) -> float:
 
 
 def measure_stillness(drift_weight: Array | None, shape: tuple[int, int]) -> Stillness:
-    """Measure how far the light of a frame (H, W) stands still by the next frame's weight; 0, in all 1, if unknown."""
+    """Measure how far the light of a frame stands still, 1 / (1 + `DRIFTED` (1 / w − 1)), w the next frame's weight.
+
+    If w (H, W) is unknown: 0 locally, 1 for the frame.
+    """
     if drift_weight is None:
         return Stillness(np.zeros(shape, np.float32), np.float32(1))
-    still = np.reciprocal(drift_weight)  # 1 / (1 + DRIFTED (1 / w − 1)), in place: frames are large
+    still = np.reciprocal(drift_weight)  # in place: frames are large
     still *= np.float32(DRIFTED)
     still += np.float32(1 - DRIFTED)
     np.reciprocal(still, out=still)
     least, enough = STANDING
-    return Stillness(still, _smooth_step(still.mean(), least, enough))
-
-
-def _smooth_step(x: Any, least: float, enough: float) -> Any:
-    """Rise from 0 at `least` to 1 at `enough`, as 3 t² − 2 t³, in float32."""
-    t = np.clip((x - np.float32(least)) / np.float32(enough - least), 0, 1)
-    return t * t * (3 - 2 * t)
+    t = np.clip((still.mean() - np.float32(least)) / np.float32(enough - least), 0, 1)
+    return Stillness(still, t * t * (3 - 2 * t))  # a smooth step
 
 
 def expect_equal_layers(frames: Sequence[PreparedFrame | None]) -> None:
     """Raise ValueError if frames of a window differ in layers: light divided by an albedo is no color."""
     centre = frames[len(frames) // 2]
     assert centre is not None
-    for there in (frame for frame in frames if frame is not None):
-        if different := sorted(_names(centre) ^ _names(there)):
-            has, lacks = (there, centre) if different[0] in _names(there) else (centre, there)
+    for frame in filter(None, frames):
+        if different := sorted(_names(centre) ^ _names(frame)):
+            has, lacks = (frame, centre) if different[0] in _names(frame) else (centre, frame)
             raise ValueError(
                 f"frame {lacks.number} has no {different[0]}, which frame {has.number} has, expected one in both"
             )
@@ -308,8 +307,9 @@ def _align_by_geometry(
         with timings.stage("warp"):
             for out, layer in zip(warped, layers_of(frame), strict=True):
                 warp_rows(layer, link.forward.vectors[rows], rows.start, out[index])
-            found = geometry[index] = confidence_by_geometry(guides, frame, link, rows, noise)
-            coverage[index], confidence[index] = found
+            coverage[index], confidence[index] = geometry[index] = confidence_by_geometry(
+                guides, frame, link, rows, noise
+            )
             _count_own_samples(window, index, rows, coverage[index], confidence[index])
         window.release()
     flows = [None if link is None else link.forward.vectors[rows] for link in window.links]
@@ -340,10 +340,8 @@ def _align_by_geometry(
 def _count_own_samples(window: Window, index: int, rows: slice, coverage: Array, confidence: Array) -> None:
     """Reduce the coverage and the confidence (h, W) of a neighbour, in place, to what its samples add to the centre."""
     link = window.links[index]
-    factors: list[Array | np.float32] = [window.samples[index]]
-    if window.repeated[index]:  # a frame nearer to the centre has the same samples
-        factors = [np.float32(0)]
-    elif "fixed-noise" in window.stages and link is not None:
+    factors: list[Array | np.float32] = [window.own_samples[index]]
+    if "fixed-noise" in window.stages and link is not None:
         factors.append(novelty_of(link.forward.vectors[rows]))
     for factor in factors:
         coverage *= factor
@@ -376,8 +374,7 @@ def _warp_first_pass(
                 coverage[index] = 0
             continue
         with timings.stage("warp"):
-            # Denoised frames have no noise that interpolation could average, only detail to lose: bicubic is worth up
-            # to 0.5 dB here.
+            # Denoised frames have detail to lose and no noise to average: bicubic interpolation gains up to 0.5 dB.
             flow = link.forward.vectors[rows]
             warp_rows(picture, flow, rows.start, warped[index], interpolation="bicubic")
             if noise is not None and link.forward.vectors.any():
@@ -417,10 +414,3 @@ def _pull_behind(
             pull_to_centre(estimates, confidence, weight, slice(top, top + strip.shape[1]))
         if samples is not None:
             samples.add(estimates, strip, top)
-
-
-def _shows_drift(window: Window) -> bool:
-    """Whether two frames on one side of the centre have flows: `nlm.drift` compares them."""
-    middle = len(window.links) // 2
-    before, after = window.links[middle - 2 : middle], window.links[middle + 1 : middle + 3]
-    return None not in before or None not in after

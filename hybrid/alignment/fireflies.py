@@ -107,33 +107,33 @@ def _find_highlights(
     last: dict[int, PreparedFrame | None] = {-1: frame, 1: frame}
     compared, equal = [(frame.sampled, still)], SAME
     for distance, side in product(range(1, REACH + 1), (-1, 1)):
-        here, undecided = last[side], witnesses.undecided
-        if here is None or not (distance == 1 or undecided.any()):
+        nearer, undecided = last[side], witnesses.undecided
+        if nearer is None or not (distance == 1 or undecided.any()):
             continue
-        there = last[side] = neighbour(distance * side)
-        if there is None:  # no motion leads to the frames behind it
+        other = last[side] = neighbour(distance * side)
+        if other is None:  # no motion leads to the frames behind it
             continue
         with timings.stage("prepare"):
-            motion = moved[side] = moved[side] + _motion(here, there, nearest_pixel(centre.points + moved[side]))
-            fade = measure_fade(there.irradiance, frame.irradiance, frame.valid & there.valid)
+            motion = moved[side] = moved[side] + _motion(nearer, other, nearest_pixel(centre.points + moved[side]))
+            fade = measure_fade(other.irradiance, frame.irradiance, frame.valid & other.valid)
             if (fade != 1).any():
-                there, equal = scaled(there, fade), NEAR
-            lights = _lights_of(there, follow_motion(centre, motion), centre, fade)
-            fresh = _has_own_noise(frame, places, there.sampled, lights, motion, compared, equal)
+                other, equal = scaled(other, fade), NEAR
+            lights = _lights_of(other, follow_motion(centre, motion), centre, fade)
+            fresh = _has_own_noise(frame, places, other.sampled, lights, motion, compared, equal)
             if distance == 1:
-                alone &= ~(fresh & recurs_nearby(places, frame.irradiance, lights.pixels, there.irradiance))
+                alone &= ~(fresh & recurs_nearby(places, frame.irradiance, lights.pixels, other.irradiance))
             tested = fresh & undecided
             same = tested & same_highlight(centre, motion, lights)
-            same[same] = without_strangers(centre[same], frame.irradiance, lights.pixels[same], there.irradiance)
+            same[same] = without_strangers(centre[same], frame.irradiance, lights.pixels[same], other.irradiance)
         witnesses.add(lights, motion, tested, same)
-        compared.append((there.sampled, motion))
+        compared.append((other.sampled, motion))
     lasting = witnesses.lasting
     return average_highlights(centre, witnesses.found)[lasting], alone & ~lasting
 
 
-def _lights_of(there: PreparedFrame, pixels: Places, centre: Highlights, fade: Array) -> Highlights:
+def _lights_of(frame: PreparedFrame, pixels: Places, centre: Highlights, fade: Array) -> Highlights:
     """Measure highlights at pixels of a frame in the light of the centre, which is `fade` times its own."""
-    lights = measure_highlights(there.irradiance, pixels, there.divisor_at)
+    lights = measure_highlights(frame.irradiance, pixels, frame.divisor_at)
     # A lamp fades with the picture or stays as it is.
     unfaded = lights.light / fade
     off, off_unfaded = (np.abs(light - centre.light).sum(axis=1) for light in (lights.light, unfaded))
@@ -143,32 +143,32 @@ def _lights_of(there: PreparedFrame, pixels: Places, centre: Highlights, fade: A
 def _has_own_noise(
     frame: PreparedFrame,
     places: Places,
-    there: Array,
+    other: Array,
     lights: Highlights,
     motion: Points,
     compared: Sequence[tuple[Array, Points]],
     equal: float,
 ) -> Mask:
-    """Return which places (K,) another frame `there` shows with samples that no frame of `compared` has.
+    """Return which places (K,) another frame `other` shows with samples that no frame of `compared` has.
 
     `compared` are those of others with the motion there; samples are the same up to a share `equal` of their value.
     """
     inside = np.isfinite(lights.light).all(axis=1)
     repeated = np.zeros(len(places), bool)
-    for other, before in compared:
-        repeated |= repeats(other, there, equal)
+    for earlier, before in compared:
+        repeated |= repeats(earlier, other, equal)
         unmoved = np.abs(motion - before).max(axis=1) < MOVED_NOISE
         if unmoved.any():
-            repeated |= unmoved & same_noise_at(*equal_noise(other, there, equal), lights.pixels)
+            repeated |= unmoved & same_noise_at(*equal_noise(earlier, other, equal), lights.pixels)
     repeated &= inside
     if repeated.any():  # without noise they are no sample shown twice
         repeated[repeated] = ~noise_free_around(frame, places[repeated])
     return inside & ~repeated
 
 
-def _motion(here: PreparedFrame, there: PreparedFrame, pixels: Places) -> Points:
+def _motion(start: PreparedFrame, end: PreparedFrame, pixels: Places) -> Points:
     """Rows and columns that pixels of a frame move by to another one; 0 without vectors."""
-    flow, valid = rendered_flow(here, there) or (None, None)
+    flow, valid = rendered_flow(start, end) or (None, None)
     if flow is None or valid is None:
         return np.zeros(pixels.shape)
     rows, columns = (np.clip(pixels[:, axis], 0, flow.shape[axis] - 1) for axis in (0, 1))

@@ -48,24 +48,24 @@ def average_guides(
             given = layer, flow, np.ascontiguousarray(own_confidence), rows.start
             run_bands(_add, len(total), *given, sums[name], total)
     for name, total in totals.items():
-        known = (total > 0)[..., None]
-        np.divide(sums[name], total[..., None], out=sums[name], where=known)
-        np.copyto(sums[name], own[name][rows], where=~known)
+        covered = (total > 0)[..., None]
+        np.divide(sums[name], total[..., None], out=sums[name], where=covered)
+        np.copyto(sums[name], own[name][rows], where=~covered)
     return sums
 
 
 @njit(nogil=True, cache=True)
 def _add(
-    first: int, last: int, layer: Array, flow: Array, confidence: Array, first_row: int, summed: Array, total: Array
+    first: int, last: int, layer: Array, flow: Array, trust: Array, first_row: int, summed: Array, total: Array
 ) -> None:
     height, width, channels = layer.shape
     half, zero = np.float32(0.5), np.float32(0)
     for y in range(first, last):
         for x in range(width):
-            if not confidence[y, x] > zero:
+            if not trust[y, x] > zero:
                 continue
             place = locate(np.float32(x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1], width, height)
-            weight = confidence[y, x] * weigh_whole(place.fx, place.fy)
+            weight = trust[y, x] * weigh_whole(place.fx, place.fy)
             row = np.uintp(place.y1 if place.fy >= half else place.y0)
             column = np.uintp(place.x1 if place.fx >= half else place.x0)
             total[y, x] += weight

@@ -83,7 +83,7 @@ LEFT, LEFT_SLIGHT = 0.5, 0.25
 SLIGHT = 0.1
 # Least logarithm of a fade; least number of areas that show one.
 LEAST_FADE, LEAST_AREAS = 0.01, 6
-# A factor is known beyond so many errors: the upper quartile of what it leaves in N areas, over √N. On rendered shots
+# A factor is certain beyond so many errors: the upper quartile of what it leaves in N areas, over √N. On rendered shots
 # of 8 to 512 samples without a fade it is at most 4.9 of them.
 KNOWN = 6.0
 # Noise counts up to this relative error, and explains what is left up to so many standard errors of an area: without a
@@ -197,12 +197,12 @@ def measure_frame(frame: PreparedFrame, small: SmallFrame) -> FrameFacts:
     )
 
 
-def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallFrame, SmallFrame]) -> PairFacts:
+def measure_pair(earlier: PreparedFrame, later: PreparedFrame, smalls: tuple[SmallFrame, SmallFrame]) -> PairFacts:
     """Measure two neighbouring frames, in order of time, and their `shrink`."""
-    vectors = rendered_flow(here, there)
+    vectors = rendered_flow(earlier, later)
     changed = _changed(smalls[0].textured(), smalls[1].textured(), None)
     if vectors is None:  # motion shows in the guides first, which have next to no noise
-        changed = max(changed, _guide_change(here, there))
+        changed = max(changed, _guide_change(earlier, later))
     speed = 0.0
     if vectors is not None:
         factor = smalls[0].factor
@@ -212,30 +212,30 @@ def measure_pair(here: PreparedFrame, there: PreparedFrame, smalls: tuple[SmallF
     fade = _fade(*smalls, reduced)
     alike = smalls[0], smalls[1].relit(inverse(fade))
     differ = changed if fade == NO_FADE else _changed(alike[0].textured(), alike[1].textured(), None)
-    lit, same = (there, SAME) if fade == NO_FADE else (scaled(there, inverse(fade)), NEAR)
-    equal = repeats(here.sampled, lit.sampled, same)
-    free = equal and _is_noise_free(here)
-    cut = differ > CUT and _is_cut(here, there, alike, vectors)
+    lit, same = (later, SAME) if fade == NO_FADE else (scaled(later, inverse(fade)), NEAR)
+    equal = repeats(earlier.sampled, lit.sampled, same)
+    free = equal and _is_noise_free(earlier)
+    cut = differ > CUT and _is_cut(earlier, later, alike, vectors)
     unexplained = changed if reduced is None else _changed(*smalls, reduced)
     return PairFacts(
-        numbers=(here.number, there.number),
+        numbers=(earlier.number, later.number),
         vectors=vectors is not None,
         speed=speed,
         changed=changed,
         unexplained=max(unexplained, _changed_areas(*smalls, reduced)),
-        fixed_noise=0.0 if free else fixed_noise(here, lit, moves=changed > 0, same=same),
-        guide_noise=_guide_noise(here, there, vectors, smalls[0].factor),
-        outline_noise=_outline_noise(here, there, vectors, smalls[0].factor),
+        fixed_noise=0.0 if free else fixed_noise(earlier, lit, moves=changed > 0, same=same),
+        guide_noise=_guide_noise(earlier, later, vectors, smalls[0].factor),
+        outline_noise=_outline_noise(earlier, later, vectors, smalls[0].factor),
         cut=cut,
         repeated=equal and not free,
         fade=NO_FADE if cut else fade,
-        samples=_samples_ratio(here, there),
+        samples=_samples_ratio(earlier, later),
     )
 
 
 def _is_cut(
-    here: PreparedFrame,
-    there: PreparedFrame,
+    earlier: PreparedFrame,
+    later: PreparedFrame,
     smalls: tuple[SmallFrame, SmallFrame],
     vectors: tuple[Array, Mask] | None,
 ) -> bool:
@@ -243,27 +243,27 @@ def _is_cut(
     shown = smalls[0].textured(), smalls[1].textured()
     if vectors is not None and _changed(*shown, _reduced(vectors, smalls[0])) <= CUT:
         return False
-    found = _search(shown[0].light, shown[1].light)
-    if _changed(*shown, found) <= CUT * _changed(*shown, None):
+    flow = _search(shown[0].light, shown[1].light)
+    if _changed(*shown, flow) <= CUT * _changed(*shown, None):
         return False
-    guides = _guides(here, there)
-    return not guides or _guide_change(here, there, vectors or _search(*guides[0])) > CUT
+    guides = _guides(earlier, later)
+    return not guides or _guide_change(earlier, later, vectors or _search(*guides[0])) > CUT
 
 
-def _search(here: Array, there: Array) -> tuple[Array, Mask]:
+def _search(picture: Array, other: Array) -> tuple[Array, Mask]:
     """Optical flow between two pictures (H, W, 3), valid everywhere."""
-    exposure = measure_exposure(here, there)
-    flow = rough_flow(tone_map(there, exposure), tone_map(here, exposure))
+    exposure = measure_exposure(picture, other)
+    flow = rough_flow(tone_map(other, exposure), tone_map(picture, exposure))
     return flow, np.ones(flow.shape[:2], bool)
 
 
-def _guides(here: PreparedFrame, there: PreparedFrame) -> list[tuple[Array, Array]]:
+def _guides(frame: PreparedFrame, neighbour: PreparedFrame) -> list[tuple[Array, Array]]:
     """Pairs of the guides that both frames have."""
-    pairs = (here.albedo, there.albedo), (here.normal, there.normal)
+    pairs = (frame.albedo, neighbour.albedo), (frame.normal, neighbour.normal)
     return [(guide, other) for guide, other in pairs if guide is not None and other is not None]
 
 
-def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool, same: float = SAME) -> float:
+def fixed_noise(frame: PreparedFrame, neighbour: PreparedFrame, *, moves: bool, same: float = SAME) -> float:
     """Measure the share of the noise of two neighbours that is the same at equal pixels, in [-1, 1]; 0 without noise.
 
     With `moves` the picture changes at equal pixels: without vectors, motion is then searched for.
@@ -274,16 +274,16 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool, same:
     parts samples of one seed are equal to the bit, and samples of two seeds by chance. Both are relative to the light,
     without their 5×5 mean, and clipped at three times their median size: fireflies must not decide.
     """
-    block = _middle(here.irradiance.shape[:2])
-    a, b = (channel_mean(frame.sampled[block]) for frame in (here, there))
+    block = _middle(frame.irradiance.shape[:2])
+    a, b = (channel_mean(each.sampled[block]) for each in (frame, neighbour))
     level = 0.5 * (cv2.blur(a, (9, 9)) + cv2.blur(b, (9, 9)))
     floor = 0.01 * measure_exposure(level[..., None])
     noise = [_high_pass(image / (level + floor)) for image in (a, b)]
     grainy = np.minimum(np.abs(noise[0]), np.abs(noise[1])) > GRAIN
-    forth, back, slowest = rendered_flow(here, there), rendered_flow(there, here), STILL_NOISE
+    forth, back, slowest = rendered_flow(frame, neighbour), rendered_flow(neighbour, frame), STILL_NOISE
     if (forth is None or back is None) and moves:
         # Optical flow is exact to some tenths of a pixel: slower motion may be none, and static pixels must be equal.
-        forth, back = _search(here.radiance, there.radiance), _search(there.radiance, here.radiance)
+        forth, back = _search(frame.radiance, neighbour.radiance), _search(neighbour.radiance, frame.radiance)
         slowest = MOVED_NOISE
     if forth is None or back is None:
         still, moved = np.ones(a.shape, bool), np.zeros(a.shape, bool)
@@ -299,38 +299,40 @@ def fixed_noise(here: PreparedFrame, there: PreparedFrame, *, moves: bool, same:
         chance = max(_equal_share(a, np.roll(b, APART, axis=1), compared, same), 0)
         figures.append((_equal_share(a, b, compared, same) - chance) / max(1 - chance, LEAST_UNEQUAL))
     if moved.sum() > CROP and forth is not None and back is not None:
-        d_a = a - channel_mean(_warp_block(there.sampled, forth[0], block))
-        d_b = b - channel_mean(_warp_block(here.sampled, back[0], block))
+        d_a = a - channel_mean(_warp_block(neighbour.sampled, forth[0], block))
+        d_b = b - channel_mean(_warp_block(frame.sampled, back[0], block))
         d = [_high_pass(image / (level + floor))[moved] for image in (d_a, d_b)]
         shares.append(int(moved.sum()))
         figures.append(2 * correlation(*d))
     return float(np.clip(np.average(figures, weights=shares), -1, 1)) if figures else 0.0
 
 
-def noise_correlation(here: PreparedFrame, there: PreparedFrame) -> Correlation | None:
+def noise_correlation(frame: PreparedFrame, neighbour: PreparedFrame) -> Correlation | None:
     """Correlation of the noise of two neighbours (`nlm.pixel_filter.measure_correlation`); None where it is unknown.
 
     Frames are compared along whole pixels of the vectors, in the middle of the picture, where their guides agree.
     Without vectors and albedo nothing tells texture that moves from noise.
     """
-    block = _middle(here.irradiance.shape[:2])
-    height, width = here.valid.shape
+    block = _middle(frame.irradiance.shape[:2])
+    height, width = frame.valid.shape
     rows, columns = np.arange(height)[block[0], None], np.arange(width)[None, block[1]]
-    vectors = rendered_flow(here, there)
-    if vectors is None and (here.albedo is None or there.albedo is None):
+    vectors = rendered_flow(frame, neighbour)
+    if vectors is None and (frame.albedo is None or neighbour.albedo is None):
         return None
-    trusted = here.valid[block].copy()
+    compared = frame.valid[block].copy()
     if vectors is not None:
         moved = np.rint(np.where(vectors[1][block][..., None], vectors[0][block], np.float32(-1e6))).astype(np.intp)
         columns, rows = columns + moved[..., 0], rows + moved[..., 1]
-        trusted &= (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+        compared &= (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
         rows, columns = rows.clip(0, height - 1), columns.clip(0, width - 1)
-    trusted &= there.valid[rows, columns]
-    for guide, other in _guides(here, there):
-        trusted &= np.abs(guide[block] - other[rows, columns]).max(axis=-1) < SAME_SURFACE
-    first, second = channel_mean(here.irradiance[block]), channel_mean(there.irradiance[rows, columns])
-    found = measure_correlation(first - second, trusted, np.float32(GRAIN) * np.maximum(np.abs(first), np.abs(second)))
-    return None if found is None else (tuple(found[0].tolist()), tuple(found[1].tolist()))
+    compared &= neighbour.valid[rows, columns]
+    for guide, other in _guides(frame, neighbour):
+        compared &= np.abs(guide[block] - other[rows, columns]).max(axis=-1) < SAME_SURFACE
+    first, second = channel_mean(frame.irradiance[block]), channel_mean(neighbour.irradiance[rows, columns])
+    measured = measure_correlation(
+        first - second, compared, np.float32(GRAIN) * np.maximum(np.abs(first), np.abs(second))
+    )
+    return None if measured is None else (tuple(measured[0].tolist()), tuple(measured[1].tolist()))
 
 
 def _equal_share(a: Array, b: Array, compared: Mask, same: float) -> float:
@@ -342,30 +344,30 @@ def _equal_share(a: Array, b: Array, compared: Mask, same: float) -> float:
     return float((equal - (near - equal) / (2 if same == SAME else 1)) / distance.size)
 
 
-def equal_noise(here: Array, there: Array, same: float = SAME) -> tuple[Array, Array]:
+def equal_noise(frame: Array, other: Array, same: float = SAME) -> tuple[Array, Array]:
     """Find pixels at which two frames (H, W, 3) have noise or detail, and those at which it is the same sample.
 
     The first (H, W) is 1 where both differ from the median of 5×5 pixels by more than 2^-8 of their value, and are not
     both black, as pixels of few samples are by chance; else 0. The second is 1 where they are also equal, as half
     floats; in a fade that is up to `NEAR`, as both are rounded.
     """
-    a, b = channel_mean(here), channel_mean(there)
+    a, b = channel_mean(frame), channel_mean(other)
     most = np.maximum(np.abs(a), np.abs(b))
     grain = np.minimum(*(np.abs(image - cv2.medianBlur(image, 5)) for image in (a, b)))
     grainy = (grain > GRAIN * most) & (most > 0)
     return grainy.astype(np.float32), (grainy & (np.abs(a - b) <= same * most)).astype(np.float32)
 
 
-def repeats(here: Array, there: Array, same: float = SAME) -> bool:
+def repeats(frame: Array, other: Array, same: float = SAME) -> bool:
     """Return whether a frame (H, W, 3) repeats another, by `equal_noise`; False if hardly any pixel has detail."""
-    height, size, grainy, equal = len(here), here.shape[0] * here.shape[1], 0, 0
+    height, size, grainy, equal = len(frame), frame.shape[0] * frame.shape[1], 0, 0
     for top in range(0, height, NOISE_ROWS):
         # With the two rows on each side that a median of 5×5 pixels reads.
         first, last = max(top - 2, 0), min(top + NOISE_ROWS, height)
-        found, alike = equal_noise(here[first : last + 2], there[first : last + 2], same)
-        grainy += int(np.count_nonzero(found[top - first : last - first]))
+        detail, alike = equal_noise(frame[first : last + 2], other[first : last + 2], same)
+        grainy += int(np.count_nonzero(detail[top - first : last - first]))
         equal += int(np.count_nonzero(alike[top - first : last - first]))
-        if grainy - equal > (1 - REPEATED) * size:  # too many already, whatever follows
+        if grainy - equal > (1 - REPEATED) * size:  # too many already
             return False
     return bool(grainy >= FEW and equal >= REPEATED * grainy)
 
@@ -415,16 +417,16 @@ def same_noise_at(grainy: Array, equal: Array, pixels: Places) -> Mask:
     return np.asarray(np.where(count >= FEW, same / np.maximum(count, 1), share) > FIXED_NOISE_ABOVE)
 
 
-def _changed(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | None) -> float:
+def _changed(frame: SmallFrame, neighbour: SmallFrame, vectors: tuple[Array, Mask] | None) -> float:
     """Share of the picture whose light differs between two frames by more than its noise, along `vectors`."""
-    exposure = measure_exposure(here.light, there.light)
-    other, inside = there.light, np.ones(here.light.shape[:2], bool)
+    exposure = measure_exposure(frame.light, neighbour.light)
+    other, inside = neighbour.light, np.ones(frame.light.shape[:2], bool)
     if vectors is not None:
         other, inside = warp(other, vectors[0])
         inside &= vectors[1]
-    inside &= _coverage(here, there)
-    window = np.stack([other, here.light, other])
-    weight = color_gate(window, here.irradiance, exposure)[0]
+    inside &= _coverage(frame, neighbour)
+    window = np.stack([other, frame.light, other])
+    weight = color_gate(window, frame.irradiance, exposure)[0]
     # The gate is e^-1 where 9×9 means differ by its scale, as 1 or 2 % of them do by noise alone. At twice the scale
     # noise brings one in a thousand.
     return float(np.mean(weight[inside] < np.exp(-4))) if inside.any() else 0.0
@@ -436,24 +438,24 @@ def inverse(fade: Fade) -> Fade:
     return red, green, blue
 
 
-def _fade(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | None) -> Fade:
+def _fade(frame: SmallFrame, neighbour: SmallFrame, vectors: tuple[Array, Mask] | None) -> Fade:
     """Factors of light from the first of two frames to the second, along `vectors`; 1 where none explain the change."""
-    other, known = there.light, here.valid & there.valid
+    other, compared = neighbour.light, frame.valid & neighbour.valid
     if vectors is not None:
-        other, inside = warp(there.light, vectors[0])
-        known = here.valid & inside & vectors[1]
-    red, green, blue = _factors(here.light, other, known, here.irradiance - here.light)
+        other, inside = warp(neighbour.light, vectors[0])
+        compared = frame.valid & inside & vectors[1]
+    red, green, blue = _factors(frame.light, other, compared, frame.irradiance - frame.light)
     return float(red), float(green), float(blue)
 
 
-def _factors(first: Array, second: Array, known: Mask, noise: Array | None = None) -> Doubles:
-    """Median (C,) of the second of two images (H, W, C) over the first, where `known`; 1 where that explains little.
+def _factors(first: Array, second: Array, compared: Mask, noise: Array | None = None) -> Doubles:
+    """Median (C,) of the second of two images (H, W, C) over the first, where `compared`; 1 where that explains little.
 
     Changes are medians of logarithms in areas of the lit part. Factors explain the changes if they leave little of
     them, or are beyond their errors and the `noise` (H, W, C) of the first image explains what they leave.
     """
     mean = channel_mean(first)
-    lit = known & (np.minimum(mean, channel_mean(second)) > NO_LIGHT)
+    lit = compared & (np.minimum(mean, channel_mean(second)) > NO_LIGHT)
     if not lit.any():
         return np.ones(first.shape[2])
     cells = _lit_cells(lit)
@@ -463,8 +465,8 @@ def _factors(first: Array, second: Array, known: Mask, noise: Array | None = Non
     if not explains and noise is not None and size > max(LEAST_FADE, KNOWN * left / np.sqrt(len(changes))):
         noise, light = (noise, first) if len(factors) == 3 else (channel_mean(noise)[..., None], mean[..., None])
         explains = left < EXPLAINED * _median_error(noise, light, lit, cells)
-    found = len(changes) >= LEAST_AREAS and explains
-    return np.broadcast_to(np.exp(factors) if found else np.ones(1), first.shape[2])
+    explained = len(changes) >= LEAST_AREAS and explains
+    return np.broadcast_to(np.exp(factors) if explained else np.ones(1), first.shape[2])
 
 
 def _lit_cells(lit: Mask) -> list[tuple[Places, ...]]:
@@ -500,8 +502,10 @@ def _is_tinted(first: Array, second: Array, lit: Mask) -> bool:
     """Whether the channels of a sixteenth of the pixels change by other factors."""
     some = np.s_[::4, ::4]
     before, after = first[some], second[some]
-    known = lit[some] & (np.minimum(before, after).min(axis=2) > NO_LIGHT)
-    return not known.any() or float(np.ptp(np.log(np.median(after[known] / before[known], axis=0)))) > LEAST_FADE / 2
+    both_lit = lit[some] & (np.minimum(before, after).min(axis=2) > NO_LIGHT)
+    if not both_lit.any():
+        return True
+    return float(np.ptp(np.log(np.median(after[both_lit] / before[both_lit], axis=0)))) > LEAST_FADE / 2
 
 
 def _changes(
@@ -509,9 +513,9 @@ def _changes(
 ) -> Doubles:
     """Median in each cell of the logarithm of the second of two images (H, W) over the first, where both are lit."""
     # A quotient, which is the same to the bit for frames times a power of two.
-    known = lit & (np.minimum(first, second) > NO_LIGHT)
-    change = np.log(np.divide(second, first, out=np.ones(first.shape), where=known, dtype=np.float64))
-    changes = [np.median(change[cell][known[cell]]) if known[cell].any() else np.nan for cell in cells]
+    both_lit = lit & (np.minimum(first, second) > NO_LIGHT)
+    change = np.log(np.divide(second, first, out=np.ones(first.shape), where=both_lit, dtype=np.float64))
+    changes = [np.median(change[cell][both_lit[cell]]) if both_lit[cell].any() else np.nan for cell in cells]
     return np.array(changes) if otherwise is None else np.where(np.isnan(changes), otherwise, changes)
 
 
@@ -542,37 +546,37 @@ def relit(frame: PreparedFrame, fade: Fade, centre: PreparedFrame) -> PreparedFr
     return replace(scaled(frame, fade), aovs=aovs)
 
 
-def _changed_areas(here: SmallFrame, there: SmallFrame, vectors: tuple[Array, Mask] | None) -> float:
+def _changed_areas(frame: SmallFrame, neighbour: SmallFrame, vectors: tuple[Array, Mask] | None) -> float:
     """Share of the picture in areas whose mean light differs by more than noise, along `vectors`.
 
     Areas are of 32×32 pixels, or the whole picture; differences are relative to the light of both, or to a twentieth of
     the exposure in the dark: the mean of tone-mapped noise would depend on its variance, which warping reduces.
     """
-    shape = here.light.shape[:2]
-    both, light, inside = [here.irradiance, there.irradiance], there.light, np.ones(shape, bool)
+    shape = frame.light.shape[:2]
+    both, light, inside = [frame.irradiance, neighbour.irradiance], neighbour.light, np.ones(shape, bool)
     if vectors is not None:
-        (both[1], inside), (light, _) = warp(there.irradiance, vectors[0]), warp(there.light, vectors[0])
+        (both[1], inside), (light, _) = warp(neighbour.irradiance, vectors[0]), warp(neighbour.light, vectors[0])
         inside &= vectors[1]
-    inside &= _coverage(here, there)
-    floor = np.float32(0.05 * measure_exposure(here.light, there.light))
-    level = 0.5 * (channel_mean(here.light) + channel_mean(light)) + floor
+    inside &= _coverage(frame, neighbour)
+    floor = np.float32(0.05 * measure_exposure(frame.light, neighbour.light))
+    level = 0.5 * (channel_mean(frame.light) + channel_mean(light)) + floor
     difference = np.where(inside, (channel_mean(both[1]) - channel_mean(both[0])) / level, np.float32(0))
     sums = np.stack([difference, np.square(difference), inside.astype(np.float32)], axis=-1)
     shares = [0.0]
     for side in {min(AREA, *shape), min(shape)} - {*range(8)}:  # fewer pixels give no estimate of the noise
-        mean, square, known = np.moveaxis(_means(sums, side).astype(np.float64), 2, 0)
-        full = known > 0.5
-        mean, square = mean[full] / known[full], square[full] / known[full]
-        error = np.sqrt(np.maximum(square - np.square(mean), 0) / (side**2 * known[full]))
+        mean, square, covered = np.moveaxis(_means(sums, side).astype(np.float64), 2, 0)
+        full = covered > 0.5
+        mean, square = mean[full] / covered[full], square[full] / covered[full]
+        error = np.sqrt(np.maximum(square - np.square(mean), 0) / (side**2 * covered[full]))
         changed = (np.abs(mean) > AREA_CHANGE) & (np.abs(mean) > AREA_NOISE * error)
         shares.append(float(changed.sum() / max(full.sum(), 1)))
     return max(shares)
 
 
-def _coverage(here: SmallFrame, there: SmallFrame) -> Mask:
+def _coverage(frame: SmallFrame, neighbour: SmallFrame) -> Mask:
     """Where the first of two frames is lit; where either is, if less than half of that: uncovered background."""
     # Closed: noise leaves single pixels of lit surfaces black.
-    lit = ((frame.valid & (channel_mean(frame.irradiance) > 0)).astype(np.uint8) for frame in (here, there))
+    lit = ((each.valid & (channel_mean(each.irradiance) > 0)).astype(np.uint8) for each in (frame, neighbour))
     shown = [cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0 for mask in lit]
     if 2 * np.count_nonzero(shown[0]) > np.count_nonzero(shown[1]):
         return np.asarray(shown[0])
@@ -584,34 +588,40 @@ def _reduced(vectors: tuple[Array, Mask], small: SmallFrame) -> tuple[Array, Mas
     flow, valid = vectors
     if small.factor == 1:
         return vectors
-    known = _means(valid.astype(np.float32)[..., None], small.factor)[..., 0]
+    covered = _means(valid.astype(np.float32)[..., None], small.factor)[..., 0]
     mean = _means(np.where(valid[..., None], flow, np.float32(0)), small.factor)
-    share = np.maximum(known, np.float32(1 / small.factor**2))[..., None]
-    return np.asarray(mean / share / np.float32(small.factor), np.float32), known > 0.5
+    share = np.maximum(covered, np.float32(1 / small.factor**2))[..., None]
+    return np.asarray(mean / share / np.float32(small.factor), np.float32), covered > 0.5
 
 
-def _guide_noise(here: PreparedFrame, there: PreparedFrame, vectors: tuple[Array, Mask] | None, factor: int) -> float:
+def _guide_noise(
+    frame: PreparedFrame, neighbour: PreparedFrame, vectors: tuple[Array, Mask] | None, factor: int
+) -> float:
     """Upper quartile of guide differences over every `factor`-th pixel; reduced guides would have less noise."""
     grid = slice(factor // 2, None, factor), slice(factor // 2, None, factor)
     differences = []
-    for guide, other in _guides(here, there):
+    for guide, other in _guides(frame, neighbour):
         warped = other[grid] if vectors is None else _warp_block(other, vectors[0], grid)
         differences += [*np.moveaxis(np.abs(guide[grid] - warped), -1, 0)]
     return float(np.quantile(np.maximum.reduce(differences), 0.75)) if differences else 0.0
 
 
 def least_outline_noise(pairs: Sequence[PairFacts]) -> tuple[float, float] | None:
-    """Return the least noise of albedo and of normals at outlines, as what vectors do not explain adds to it.
+    """Return the least noise of albedo and of normals at outlines: errors of vectors add to the others.
 
     None if it is unknown for a pair without a cut, and without pairs.
     """
     noises = [pair.outline_noise for pair in pairs if not pair.cut]
-    known = [noise for noise in noises if noise is not None]
-    return (min(n[0] for n in known), min(n[1] for n in known)) if known and len(known) == len(noises) else None
+    measured = [noise for noise in noises if noise is not None]
+    return (
+        (min(n[0] for n in measured), min(n[1] for n in measured))
+        if measured and len(measured) == len(noises)
+        else None
+    )
 
 
 def _outline_noise(
-    here: PreparedFrame, there: PreparedFrame, vectors: tuple[Array, Mask] | None, factor: int
+    frame: PreparedFrame, neighbour: PreparedFrame, vectors: tuple[Array, Mask] | None, factor: int
 ) -> tuple[float, float] | None:
     """Share of the noise of albedo and normals at outlines that move by whole pixels, in one of `factor` bands of rows.
 
@@ -619,26 +629,29 @@ def _outline_noise(
     """
     both = {
         name: (guide, other)
-        for name, guide, other in (("albedo", here.albedo, there.albedo), ("normal", here.normal, there.normal))
+        for name, guide, other in (
+            ("albedo", frame.albedo, neighbour.albedo),
+            ("normal", frame.normal, neighbour.normal),
+        )
         if guide is not None and other is not None
     }
     if vectors is None or not both or at_whole_pixels(vectors[0][::factor, ::factor]).mean() < WHOLE_PIXELS:
         return None
     others = {f"other_{name}": other for name, (_, other) in both.items()}
-    found: list[tuple[Array, Array, Mask]] = []
-    for top in range(0, len(here.valid), factor * OUTLINE_ROWS):
+    bands: list[tuple[Array, Array, Mask]] = []
+    for top in range(0, len(frame.valid), factor * OUTLINE_ROWS):
         rows = slice(top, top + OUTLINE_ROWS)
         guides = {name: guide[rows] for name, (guide, _) in both.items()}
         flow, valid = (layer[rows] for layer in vectors)
-        inside = find_coverage(flow, valid, there.valid, top) & at_whole_pixels(flow)
+        inside = find_coverage(flow, valid, neighbour.valid, top) & at_whole_pixels(flow)
         distance = compare_guides(flow, inside=inside, **guides, **others, first_row=top)
         outlines = outline_variance(local_variance(guides.get("albedo"), guides.get("normal")), distance)
-        found.append((outlines, distance, inside))
-    return measure_share(*(np.concatenate(layers) for layers in zip(*found, strict=True)))
+        bands.append((outlines, distance, inside))
+    return measure_share(*(np.concatenate(layers) for layers in zip(*bands, strict=True)))
 
 
 def _guide_grain(guides: Sequence[Array]) -> float | None:
-    """Upper quartile over pixels, of those in some rows, of the second differences of guides (H, W, C)."""
+    """Upper quartile of the second differences of guides (H, W, C) in every `GRAIN_ROWS`-th row."""
     if not guides:
         return None
     grain, shown = np.zeros(1, np.float32), np.zeros(1, bool)
@@ -658,18 +671,18 @@ def _alpha_grain(alpha: Array) -> float:
 
 
 def _noise(light: Array) -> float:
-    """Median over pixels, of those in some rows, of the second differences of lit ones, relative to the light."""
+    """Median of the second differences of lit pixels, relative to the light, in every `GRAIN_ROWS`-th row."""
     bent, level = (part.mean(axis=-1) for part in _second_differences(light))
     lit = level > 0
     return float(np.median(np.abs(bent[lit]) / level[lit])) if lit.any() else 0.0
 
 
-def _samples_ratio(here: PreparedFrame, there: PreparedFrame) -> float:
-    """Samples of a frame over those of the one before: as stated, or by their noise, 1 where that is much the same."""
-    if here.samples is not None and there.samples is not None:
-        return there.samples / here.samples
+def _samples_ratio(earlier: PreparedFrame, later: PreparedFrame) -> float:
+    """Samples of the later frame over those of the earlier one: as stated, or by noise; 1 where that is similar."""
+    if earlier.samples is not None and later.samples is not None:
+        return later.samples / earlier.samples
     noises = []
-    for frame in (here, there):
+    for frame in (earlier, later):
         change, level = (
             np.add.reduceat(part.mean(axis=-1), np.arange(0, part.shape[1], GRAIN_COLUMNS), axis=1)
             for part in map(np.abs, _second_differences(frame.irradiance))
@@ -691,10 +704,10 @@ def _second_differences(layer: Array) -> tuple[Array, Array]:
     return second_differences(strips)[1::3] / np.float32(6), np.asarray(cv2.blur(strips, (3, 3)), np.float32)[1::3]
 
 
-def _guide_change(here: PreparedFrame, there: PreparedFrame, vectors: tuple[Array, Mask] | None = None) -> float:
+def _guide_change(frame: PreparedFrame, neighbour: PreparedFrame, vectors: tuple[Array, Mask] | None = None) -> float:
     """Share of the picture whose guides differ along the vectors, in means of 9×9 pixels, by more than noise."""
     shares = [0.0]
-    for guide, other in _guides(here, there):
+    for guide, other in _guides(frame, neighbour):
         moved = other if vectors is None else warp(other, vectors[0])[0]
         difference = cv2.blur(guide - moved, (9, 9))
         shares.append(float(np.mean(np.square(difference).sum(axis=-1) > 3 * GUIDE_CHANGE**2)))

@@ -12,12 +12,12 @@ from hybrid.alignment.window import Geometry
 from hybrid.files.frame import Array
 from loops.parallel import run_bands
 
-# The confidence that geometry leaves at least to denoised frames of one color: outlines, whose albedo and normals
-# are mixed anew in each frame, flicker most. Worth 0.1 to 0.2 dB, and 1 dB in time, at 16 to 32 samples; 1 and 2 dB
-# at 6 to 10, where more (0.5) would be better yet.
+# Least confidence by geometry in denoised frames of one color: outlines, whose albedo and normals are mixed anew in
+# each frame, flicker most. It gains 0.1 to 0.2 dB, and 1 dB in time, at 16 to 32 samples; 1 and 2 dB at 6 to 10, where
+# 0.5 gains more.
 AGREEING = 0.3
-# With one seed for all frames a neighbour's noise is the centre's until the picture has moved so far, pixels: a
-# bilinear sample half a pixel away still shares its noise, one and a half pixels away hardly.
+# With one seed for all frames a neighbour has the centre's noise up to the first motion, and its own from the second
+# on, pixels: a bilinear sample half a pixel away shares the noise, one and a half pixels away hardly.
 SAME_NOISE, OTHER_NOISE = 0.5, 1.5
 
 

@@ -107,7 +107,7 @@ class PreparedFrame:
 
     @property
     def sampled(self) -> Array:
-        """Irradiance (H, W, C) in which samples are compared: those of frames with other filters undone differ."""
+        """Irradiance (H, W, C) for comparing samples, without the undoing of filters, which differ between frames."""
         return self.irradiance if self.as_rendered_gray is None else self.as_rendered_gray
 
     @property
@@ -251,17 +251,17 @@ def rough_light(irradiance: Array, albedo: Array | None, normal: Array | None) -
     return guided_filter(clean[0], guide, radius=5, eps=1e-2, subsample=2)
 
 
-def rendered_flow(here: PreparedFrame, there: PreparedFrame) -> tuple[Array, Mask] | None:
-    """Return the renderer's flow (H, W, 2) over n frames, n times its vectors, and where it is known; None without."""
-    step = abs(there.number - here.number)
-    forward = there.number > here.number
-    direct = here.motion and (here.motion.to_next if forward else here.motion.to_previous)
+def rendered_flow(start: PreparedFrame, end: PreparedFrame) -> tuple[Array, Mask] | None:
+    """Return the renderer's flow (H, W, 2) over n frames, n times its vectors, and its validity; None without."""
+    step = abs(end.number - start.number)
+    forward = end.number > start.number
+    direct = start.motion and (start.motion.to_next if forward else start.motion.to_previous)
     if direct is not None:
         return _times(direct.flow, step), direct.valid
-    reverse = there.motion and (there.motion.to_previous if forward else there.motion.to_next)
+    reverse = end.motion and (end.motion.to_previous if forward else end.motion.to_next)
     if reverse is not None:
         # The other frame's vectors lead from its pixels to this frame.
-        return invert_flow(_times(reverse.flow, step), valid=reverse.valid, depth=there.depth)
+        return invert_flow(_times(reverse.flow, step), valid=reverse.valid, depth=end.depth)
     return None
 
 

@@ -109,7 +109,7 @@ def _sum_limited(
     first: int, last: int, irradiance: Array, first_pass: Array, albedo: Array, exposure: np.float32, rows: Axis,
     columns: Axis, sums: Array,
 ) -> None:  # fmt: skip
-    """Sum over cells the limited residuals per unit of light, and what the limit cuts off."""
+    """Sum over cells the limited residuals per unit of light, and the light that the limit cuts off."""
     side, residual = len(rows.pixels) // sums.shape[1], np.empty(3, np.float32)
     for row in range(first, last):
         for y in rows.pixels[row * side : (row + 1) * side]:

@@ -19,7 +19,7 @@ LIT = 1e-2
 # networks otherwise see it as black, 1 to 4 dB worse than their first pass in place of 3 to 7 dB better. With 1e-4 the
 # rim of a cut-out object loses 0.5 dB.
 DIM = 1e-3
-# Share of an image's exposure that OIDN's measure leaves out as black. OIDN leaves out 1e-8 whatever the unit.
+# Share of an image's exposure below which OIDN's measure excludes pixels as black. OIDN excludes 1e-8 in any unit.
 BLACK = 1e-8
 MIDDLE_GRAY = 0.18  # OIDN's factor maps the geometric mean to it
 
@@ -106,7 +106,7 @@ def measure_gain(picture: Array, dark: float = DIM) -> float:
 
 
 def measure_typical_exposure(picture: Array) -> float:
-    """Return the exposure of a picture (H, W, 3), or twice the geometric mean of what is lit, whichever is less.
+    """Return the exposure of a picture (H, W, 3), or twice the geometric mean of its lit part, if that is less.
 
     Beside a window over a third of a picture, its mean would hide errors of the room: the noise of the room then
     came through, 2 dB where the window has 100 times its light. In 38 of 40 rendered shots the first is less.
@@ -121,7 +121,7 @@ def autoexposure(radiance: Array, *, dark: float = BLACK, exposure: float = 1.0)
     The radiance is divided by `exposure` first; bins of a luminance of at most `dark` are excluded.
 
     ``0.18 / 2^mean(log2 L)``, L the mean luminances above `dark` of bins of at most 16×16 pixels, as in OIDN's
-    ``training/color.py``; `network.unet.autoexposure` is the same in torch.
+    ``training/color.py``.
     """
     image = np.maximum(radiance / np.float32(exposure), 0)
     luminance = image @ np.array([0.212671, 0.715160, 0.072169], np.float32)  # their sum is below 1: none overflows

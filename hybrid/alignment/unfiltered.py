@@ -70,7 +70,7 @@ class Unfiltered:
         return guided_filter(self.negative[name], shown, radius=4, eps=1e-3)
 
     def without_empty(self, light: Array) -> Array:
-        """Return the color or a part of it (H, W, 3) set to 0 where nothing is, if such pixels are known."""
+        """Return the color or a part of it (H, W, 3) set to 0 at the pixels of `empty`, if there are any."""
         return light if self.empty is None else np.where(self.empty[..., None], np.float32(0), light)
 
     def without_outside(self, layer: Array) -> Array:
@@ -128,7 +128,7 @@ def split_unfiltered(frame: Frame) -> tuple[Array, Unfiltered]:
     negative in all channels is the trace of a filter with negative lobes next to a lamp, and stays.
     """
     layers = {"color": frame.color, **frame.aovs}
-    negative = {name: found for name, layer in layers.items() if (found := _negative(layer)) is not None}
+    negative = {name: part for name, layer in layers.items() if (part := _negative(layer)) is not None}
     color = frame.color - negative["color"] if "color" in negative else frame.color
     gray = frozenset(name for name, layer in layers.items() if _is_gray(layer))
     return color, Unfiltered(_lights(frame), negative, gray, empty=_empty(frame))
@@ -176,16 +176,16 @@ def _negative(layer: Array) -> Array | None:
     if layer.shape[-1] != 3 or not (layer < 0).any():
         return None
     light = np.maximum(layer.max(axis=-1, keepdims=True), 0)
-    found = np.nan_to_num(np.maximum(np.minimum(layer, 0), -light), nan=0, posinf=0, neginf=0)
-    return found if found.any() else None
+    negative = np.nan_to_num(np.maximum(np.minimum(layer, 0), -light), nan=0, posinf=0, neginf=0)
+    return negative if negative.any() else None
 
 
 def _lights(frame: Frame) -> Array | None:
     """The radiance of lights beyond half, NaN elsewhere; None without such lights."""
     if frame.beyond is None:
         return None
-    known = np.where(frame.beyond, np.float32(HALF_MAX), frame.color)
-    mask = frame.beyond.any(axis=-1) & np.isfinite(known).all(axis=-1)
+    radiance = np.where(frame.beyond, np.float32(HALF_MAX), frame.color)
+    mask = frame.beyond.any(axis=-1) & np.isfinite(radiance).all(axis=-1)
     _, labels, sizes, _ = cv2.connectedComponentsWithStats(np.asarray(mask, np.uint8), connectivity=8)
     mask &= sizes[labels, cv2.CC_STAT_AREA] >= _LIGHT
-    return np.where(mask[..., None], known, np.float32(np.nan)) if mask.any() else None
+    return np.where(mask[..., None], radiance, np.float32(np.nan)) if mask.any() else None

@@ -34,14 +34,15 @@ class Window:
     links: tuple[Link | None, ...]  # None for the centre, and where a flow is missing
     first_pass: tuple[Array | None, ...] | None  # (H, W, 3): denoised radiance of each frame; None without a first pass
     stages: frozenset[str]  # the stages that run
-    repeated: tuple[bool, ...]  # whether a frame has the samples of the frame beside it on the side of the centre
-    samples: tuple[np.float32, ...]  # samples of each frame over those of the centre, at most 1
+    # samples of each frame over those of the centre, at most 1; 0 if the frame beside it, towards the centre, has the
+    # same samples
+    own_samples: tuple[np.float32, ...]
     # the shares of the picture on which TV-L1 corrected vectors, for all flows within the window
     refined: tuple[float, ...] = ()
     outline_noise: tuple[float, float] = (0.0, 0.0)  # the least of `measure.PairFacts` within the window
     # (H, W, 3): albedo and normal of each frame without noise; None where no network needs them
     filtered_guides: tuple[Mapping[str, Array] | None, ...] | None = None
-    limited: tuple[Limited | None, ...] = ()  # what the limit of residuals takes from each frame with a first pass
+    limited: tuple[Limited | None, ...] = ()  # light lost by the limit of residuals in each frame with a first pass
     release: Callable[[], None] = _nothing  # called when a frame has been read (`hybrid.runtime.kept.Keeper.release`)
 
     @property
@@ -55,8 +56,8 @@ class Window:
     def lit(self) -> PreparedFrame:
         """The frame nearest to the centre with any valid pixel."""
         centre = self.centre.number
-        there = [frame for frame in self.frames if frame is not None]
-        return min(there, key=lambda frame: (not frame.valid.any(), abs(frame.number - centre)))
+        present = [frame for frame in self.frames if frame is not None]
+        return min(present, key=lambda frame: (not frame.valid.any(), abs(frame.number - centre)))
 
 
 class Geometry(NamedTuple):
@@ -133,7 +134,7 @@ class Centre:
     # (h, W, 3): without rejected outliers; the mean of the neighbours where the renderer's color was not finite
     irradiance: Array
     guides: dict[str, Array]  # (h, W, 3): albedo and normal, as far as there are any
-    # (h, W, 3): the albedo, prefiltered where the plan has it; None also where nobody reads the `guide`
+    # (h, W, 3): the albedo, prefiltered where the plan has it; None also where `AlignedWindow.guide` is not read
     clean_albedo: Array | None
     filtered_guides: dict[str, Array] | None = None  # (h, W, 3): `guides` without noise, as `Window.filtered_guides`
     first_pass: Array | None = None  # (H, W, 3): radiance of the whole frame
@@ -159,9 +160,9 @@ class AlignedWindow:
     neighbours: Neighbours
     sources: WarpSources  # the frames and flows, for layers that are warped when they are read
     stages: frozenset[str]  # the stages that run
-    inner: slice  # the requested rows; those around them are there because the result depends on them
+    inner: slice  # the requested rows, among the rows around them that the result depends on
     confidence: Array  # (T, h, W), in [0, 1]; the centre's is 1 wherever its own color was finite
-    # (T, h, W): confidence by geometry alone, with which guides are prefiltered; None where nobody reads the `guide`
+    # (T, h, W): confidence by geometry alone, with which guides are prefiltered; None where `guide` is not read
     geometric_confidence: Array | None
     modulation: Array  # (h, W, 3): radiance of an irradiance of 1: the centre's prefiltered albedo plus the floor, or 1
     brightness: Brightness  # of the centre, or of the nearest frame with light

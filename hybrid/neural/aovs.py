@@ -39,7 +39,7 @@ def filter_aovs(aligned: AlignedWindow, irradiance: Array) -> dict[str, Array]:
     light = compress(irradiance.mean(axis=-1, keepdims=True), aligned.brightness.exposure)
     guide = np.concatenate([*([] if aligned.guide is None else [aligned.guide]), light], axis=-1)
     moments = aligned.brightness.moments[:, : guide.shape[-1]]
-    if any(not found.complete for found in aligned.centre.frame.passes.sums):
+    if any(not total.complete for total in aligned.centre.frame.passes.sums):
         means[BEAUTY] = average(aligned.color, aligned.confidence)
         names.append(BEAUTY)
     return means | dict(zip(names, filter_layers([means[n] for n in names], guide, moments=moments), strict=True))
@@ -59,23 +59,23 @@ def share_out(aligned: AlignedWindow, filtered: dict[str, Array], irradiance: Ar
     images = {name: add_light([part], [factors[name]]) for name, part in aovs.items()}
     images[BEAUTY] = irradiance * aligned.modulation
     # The color becomes one sum alone; other sums of the same light are scaled to it then.
-    first = next((found for found in sums if found.whole == BEAUTY and found.complete), None) if add else None
-    for found in ([first] if first else []) + [other for other in sums if other is not first]:
-        parts, whole = [filtered[name] for name in found.parts], found.whole
-        by = [factors[name] for name in found.parts]
-        if found is first:
+    first = next((total for total in sums if total.whole == BEAUTY and total.complete), None) if add else None
+    for total in ([first] if first else []) + [other for other in sums if other is not first]:
+        parts, whole = [filtered[name] for name in total.parts], total.whole
+        by = [factors[name] for name in total.parts]
+        if total is first:
             images[BEAUTY] = add_light(parts, by)
             split = parts
-        elif found.complete:
+        elif total.complete:
             bounds = [
-                average(aligned.aovs[name], aligned.confidence) if name in pass_colors else None for name in found.parts
+                average(aligned.aovs[name], aligned.confidence) if name in pass_colors else None for name in total.parts
             ]
             split = split_light(parts, images[whole], exposure=exposure, factors=by, bounds=bounds)
         else:
             # The light that is in none of the parts is a further part.
             rest = np.maximum(filtered_color - add_light(parts, by), 0)
             split = split_light([*parts, rest], images[whole], exposure=exposure, factors=[*by, None])[:-1]
-        for name, part, factor in zip(found.parts, split, by, strict=True):
+        for name, part, factor in zip(total.parts, split, by, strict=True):
             aovs[name] = part
             images[name] = add_light([part], [factor])
     for name in aovs:
@@ -85,7 +85,7 @@ def share_out(aligned: AlignedWindow, filtered: dict[str, Array], irradiance: Ar
             aovs[name] = np.where(_is_uniform(centre_alpha), centre_alpha, clean)
         elif name not in pass_colors and (factor := factors[name]) is not None:
             aovs[name] = aovs[name] * factor
-    return SharedLight(aovs, images[BEAUTY], frozenset(name for found in sums for name in found.parts))
+    return SharedLight(aovs, images[BEAUTY], frozenset(name for total in sums for name in total.parts))
 
 
 def _factor(name: str, aligned: AlignedWindow) -> Array | None:

@@ -111,8 +111,8 @@ class NetworkDenoiser(WindowDenoiser):
                 if tile.aovs is not None:
                     filtered[inner] = image_of(tile.aovs)[offset]
                 if parts is not None:
-                    found = torch.cat(tile.parts(), 2)[0].permute(0, 2, 3, 1).cpu().numpy()
-                    parts[:, *inner] = found[:, *offset]
+                    contributions = torch.cat(tile.parts(), 2)[0].permute(0, 2, 3, 1).cpu().numpy()
+                    parts[:, *inner] = contributions[:, *offset]
         return Result(irradiance, filtered, parts)
 
     def _count_parts(self, aligned: AlignedWindow, result: Result) -> dict[str, Array]:
