@@ -83,9 +83,11 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.neural
 @pytest.mark.posix
 @pytest.mark.usefixtures("folder")
 def test_in_a_shell(capsys):
+    pytest.importorskip("torch")
     commands = list(transcript("command-line.md", "transcript"))
     assert len(commands) == 5
     for (program, *words), answer in commands:

@@ -100,8 +100,10 @@ def test_options_are_passed_on_as_they_were_given():
     assert seen[0][1:] == ["--output=-b", "--layer=color=x", "--layer=normal=y", "--resume", "--", "a", "-c"]
 
 
+@pytest.mark.neural
 @pytest.mark.posix
 def test_what_the_documentation_says(cluster, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("torch")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     documented = "tcp://192.168.1.10:8786"
