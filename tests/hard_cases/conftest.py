@@ -1,7 +1,5 @@
 """Hard cases carry a mark, so that the quick loop can leave them out."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Shots without files, and the whole chain on them."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable
 from dataclasses import replace
 

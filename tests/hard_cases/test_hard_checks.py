@@ -1,7 +1,5 @@
 """Arrays are checked where they enter and where they leave: an error that names the frame, and no file."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
@@ -13,6 +11,7 @@ from hybrid.files.exr import read_exr
 from hybrid.files.shots import open_shot
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window
 from tests.scenes import Scene
+from tests.seldom import seldom
 
 SCENE = Scene(height=32, width=48, frames=5)
 MIDDLE = SCENE.first + 2
@@ -35,7 +34,7 @@ def colors(folder):
     return {number: shot.read(number).color for number in shot.numbers}
 
 
-@pytest.mark.parametrize("value", [1e15, 1e20, 1e30, -1e30, 3e38])
+@pytest.mark.parametrize("value", [1e30, *seldom(1e15, -1e30, 3e38)])
 @pytest.mark.parametrize("layer", ["Combined", "Denoising Albedo", "Denoising Normal", "Depth", "Vector"])
 def test_one_finite_but_absurd_value_leaves_the_frames_around_alone(tmp_path, plain, layer, value):
     """A pixel of 1e30 made NaN of five frames."""
@@ -57,8 +56,6 @@ def test_one_finite_but_absurd_value_leaves_the_frames_around_alone(tmp_path, pl
     [
         ("nan", f"the first pass of frame {MIDDLE}: 1536 of 1536 pixels are not finite"),
         ("half nan", f"the first pass of frame {MIDDLE}: 768 of 1536 pixels are not finite"),
-        ("huge", f"the first pass of frame {MIDDLE}: 1536 of 1536 pixels are not finite"),
-        ("black", f"the first pass of frame {MIDDLE}: it has 0 times the light in channel R"),
         ("exposed", f"the first pass of frame {MIDDLE}: it has 4.* times the light in channel R"),
         ("no red", f"the first pass of frame {MIDDLE}: it has 0 times the light in channel R"),
     ],
@@ -69,9 +66,8 @@ def test_an_estimate_that_cannot_be_right_is_named_and_nothing_is_made_of_it(tmp
     def edit(index, layers):
         color = layers["ViewLayer.Combined"]
         if index == 2:
-            color[: 16 if what == "half nan" else None] *= {"exposed": 4, "black": 0, "no red": 1}.get(what, np.nan)
+            color[: 16 if what == "half nan" else None] *= {"exposed": 4, "no red": 1}.get(what, np.nan)
             color[..., 0] *= 0 if what == "no red" else 1
-            color[np.isnan(color)] = np.float32(1e30) if what == "huge" else np.nan
 
     estimates = SCENE.write(tmp_path / "estimates", clean=True, edit=edit)
     out = tmp_path / "out"
@@ -93,9 +89,7 @@ def test_few_lost_pixels_of_an_estimate_are_filled_in(tmp_path):
     ("factor", "said"),
     [
         (np.nan, "color: 1536 of 1536 pixels are not finite; it was not written"),
-        (np.inf, "color: 1536 of 1536 pixels are not finite; it was not written"),
         (4, r"[34]\.?\d? times the light in channel R.*; it was not written"),
-        (0.2, r"0\.2\d? times the light in channel R.*; it was not written"),
         (0, "0 times the light in channel R.*; it was not written"),
     ],
 )
@@ -118,7 +112,7 @@ def test_a_picture_that_cannot_be_right_is_not_written(tmp_path, capsys, monkeyp
 
 
 @pytest.mark.neural
-@pytest.mark.parametrize("scale", [30.0, 300.0, -30.0])
+@pytest.mark.parametrize("scale", [30.0, -30.0])
 def test_absurd_weights_make_no_pictures_that_are_not_finite(tmp_path, capsys, scale):
     torch = pytest.importorskip("torch")
     from network.checkpoint import load_model, save_model, shipped_weights

@@ -1,5 +1,7 @@
 """NaN, +Inf and -Inf in every layer: the picture is finite, the damage stays where it is, and is told of once."""
 
+from functools import lru_cache
+
 import numpy as np
 import pytest
 
@@ -22,8 +24,9 @@ from tests.hard_cases.hard import (
     within_range,
 )
 from tests.scenes import Scene
+from tests.seldom import seldom
 
-VALUES = {"nan": np.nan, "inf": np.inf, "minus-inf": -np.inf}
+values = pytest.mark.parametrize("value", [np.nan, *seldom(np.inf, -np.inf)], ids=["nan", "inf", "minus-inf"])
 PLACES = {
     "pixel": (slice(20, 21), slice(28, 29)),
     "block": (slice(10, 26), slice(14, 40)),
@@ -51,7 +54,7 @@ def corrupted(frames, layer, value, place, which):
     return out
 
 
-@pytest.mark.parametrize("value", VALUES.values(), ids=VALUES)
+@values
 @pytest.mark.parametrize("layer", LAYERS)
 def test_the_picture_is_finite_and_in_range(layer, value, record_property):
     frames = with_variance()
@@ -65,8 +68,8 @@ def test_the_picture_is_finite_and_in_range(layer, value, record_property):
 
 
 @pytest.mark.neural
-@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
-@pytest.mark.parametrize("value", VALUES.values(), ids=VALUES)
+@pytest.mark.parametrize("precision", ["bfloat16", *seldom("float32")])
+@values
 def test_the_network_is_finite(value, precision, record_property):
     pytest.importorskip("torch")
     from hybrid.neural import open_network
@@ -116,11 +119,16 @@ def test_each_frame_with_lost_pixels_is_told_of_once(tmp_path, capsys):
     ]
 
 
-@pytest.mark.parametrize("value", VALUES.values(), ids=VALUES)
+@lru_cache
+def undamaged(scene):
+    return denoise(shot(scene))[1]
+
+
+@values
 @pytest.mark.parametrize("layer", ["color", "albedo", "normal", "motion"])
 def test_damage_stays_within_the_support(layer, value, record_property):
     scene = Scene(height=64, width=96, frames=5)
-    plain = denoise(shot(scene))[1]
+    plain = undamaged(scene)
     place = slice(30, 32), slice(40, 42)
     # The warp moves a side frame by 2 px at most here; a wrong vector fetches from elsewhere, but into its own pixel.
     reach = SUPPORT + 2

@@ -1,9 +1,7 @@
 """Files that are damaged at random: each ends in one line, or is still a valid file and is read.
 
-100 files belong to the quick tests; `pytest -m reliability` tries 1,900 others.
+25 files belong to the quick tests; `pytest -m reliability` tries 1,975 others.
 """
-
-from __future__ import annotations
 
 import re
 import struct
@@ -17,9 +15,10 @@ import pytest
 from hybrid.files.exr import read_exr
 from hybrid.records import FOLDER
 from tests.commands import ravg
+from tests.seldom import seldom
 
 pytestmark = pytest.mark.posix
-CASES = 100
+CASES = 25
 MOST = 5.0, 2**30  # CPU seconds, and bytes of memory
 COMPRESSIONS = ("NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB")
 
@@ -135,7 +134,7 @@ def run_case(source: Path, output: Path) -> bool:
     return True
 
 
-@pytest.mark.parametrize("batch", [0, *(pytest.param(n, marks=pytest.mark.reliability) for n in range(1, 20))])
+@pytest.mark.parametrize("batch", [0, *seldom(*range(1, 80))])
 def test_damaged_files_end_in_one_line(tmp_path, good_files, record_property, batch):
     """Within 5 CPU seconds and 1 GiB, without output and without a crash of the interpreter."""
     refused = Counter[str]()

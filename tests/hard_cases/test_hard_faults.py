@@ -1,9 +1,6 @@
 """Faults from outside: kills, Ctrl-C, full disks, little memory. Nothing is lost, and nothing is half there."""
 
-from __future__ import annotations
-
 import os
-import platform
 import re
 import shutil
 import signal
@@ -18,7 +15,7 @@ import pytest
 
 from hybrid.cli import main
 from hybrid.files.exr import read_exr, write_exr
-from hybrid.files.replace import remove_leftovers, remove_unfinished, replace_file, temporary_folder
+from hybrid.files.replace import remove_leftovers, remove_unfinished, temporary_folder
 from hybrid.files.shots import open_shot
 from hybrid.first_pass import Classical, PerFrame
 from hybrid.memory import MemoryPlan, parse_size, plan_memory
@@ -29,6 +26,7 @@ from hybrid.runtime.interrupt import interruptible
 from hybrid.stream import FrameStream
 from tests.hard_cases.test_hard_files import ROOT, run_alone
 from tests.scenes import Scene, only
+from tests.seldom import seldom
 
 
 def draft(folder, out, *more):
@@ -90,12 +88,10 @@ def render_again(path, note, seconds=None):
 @pytest.mark.parametrize(
     ("what", "again"),
     [
-        ("an older frame", range(1001, 1010)),
         ("a frame of the same size and time", range(1001, 1010)),
         ("a frame that comes late", range(1005, 1011)),
         ("a frame that is gone", range(1005, 1010)),
         ("an estimate made again", range(1001, 1010)),
-        ("an older estimate", range(1001, 1010)),
         ("other vectors", range(1001, 1011)),
         ("another version", range(1001, 1011)),
         ("the project unpacked elsewhere", ()),
@@ -113,9 +109,7 @@ def test_resume_makes_again_what_was_made_from_something_else(tmp_path, capsys, 
     more = []
     assert draft(folder, out, "--first-pass", str(estimates)) == 0
     before = stamps(out)
-    if what == "an older frame":
-        render_again(frame, "again", 1e9)
-    elif what == "a frame of the same size and time":
+    if what == "a frame of the same size and time":
         render_again(frame, "other")
     elif what == "a frame that comes late":
         (tmp_path / "late.exr").rename(last)
@@ -124,8 +118,6 @@ def test_resume_makes_again_what_was_made_from_something_else(tmp_path, capsys, 
         last.unlink()
     elif what == "an estimate made again":
         render_again(estimate, "other")
-    elif what == "an older estimate":
-        render_again(estimate, "other", 1e9)
     elif what == "other vectors":
         more = ["--motion", "none"]
     elif what == "another version":
@@ -322,35 +314,13 @@ def test_the_folder_of_a_killed_process_is_removed_by_the_next_and_that_of_a_liv
     assert list(tmp_path.iterdir()) == []
 
 
-def test_two_threads_may_write_one_file(tmp_path):
-    with replace_file(tmp_path / "a") as first:
-        first.write_text("first")
-        assert not (tmp_path / "a").exists()
-    assert (tmp_path / "a").read_text() == "first"
-    assert [path.name for path in tmp_path.iterdir()] == ["a"]
-
-
 # --- memory
 
 
 def test_sizes_are_understood_or_refused():
     assert parse_size("8G") == parse_size("8 GiB") == parse_size("8192M") == 8 * 2**30
     assert parse_size("1.5g") == 1.5 * 2**30
-    for words in (
-        "",
-        "8",
-        "1000",
-        "8B",
-        "8 apples",
-        "-1G",
-        "G",
-        "8GG",
-        "nan",
-        "0",
-        "0.0G",
-        "9" * 400,
-        "1" + "0" * 400 + "G",
-    ):
+    for words in ("", "8", "8B", "8 apples", "-1G", "G", "8GG", "nan", "0", "0.0G", "9" * 400, "1" + "0" * 400 + "G"):
         with pytest.raises(ValueError, match=r"max-memory is .*, expected a size with its unit, such as 8G"):
             parse_size(words)
 
@@ -366,17 +336,16 @@ def tall(tmp_path_factory):
 @pytest.mark.parametrize("stages", [{"demodulate", "outliers", "warp", "gate", "prefilter"}, {"warp", "refine"}, set()])
 def test_a_frame_made_in_parts_is_the_frame(tall, stages, record_property):
     """The promise is 1e-5; the classical chain keeps every bit."""
-    shot, number = open_shot(tall), TALL.first + 2
-    for preset in CLASSICAL_PRESETS.values():
-        whole = filter_window(FrameStream(shot, only(stages)).align(number), preset)
-        for rows in (64, 128, 320):
-            aligner = FrameStream(shot, only(stages))
-            parts = []
-            for top in range(0, TALL.height, rows):
-                aligned = aligner.align(number, slice(top, min(top + rows, TALL.height)))
-                parts.append(filter_window(aligned, preset)[aligned.inner])
-            np.testing.assert_array_equal(np.concatenate(parts), whole)
-    record_property("cases", 3 * len(CLASSICAL_PRESETS))
+    shot, number, preset = open_shot(tall), TALL.first + 2, CLASSICAL_PRESETS["final"]  # which reaches furthest
+    whole = filter_window(FrameStream(shot, only(stages)).align(number), preset)
+    for rows in (64, 320):
+        aligner = FrameStream(shot, only(stages))
+        parts = []
+        for top in range(0, TALL.height, rows):
+            aligned = aligner.align(number, slice(top, min(top + rows, TALL.height)))
+            parts.append(filter_window(aligned, preset)[aligned.inner])
+        np.testing.assert_array_equal(np.concatenate(parts), whole)
+    record_property("cases", 2)
 
 
 def test_an_interrupt_within_a_dispatcher_of_numba_is_one():
@@ -393,7 +362,7 @@ def test_an_interrupt_within_a_dispatcher_of_numba_is_one():
 
 
 @pytest.mark.neural
-@pytest.mark.parametrize("rows", [64, 192])
+@pytest.mark.parametrize("rows", [192, *seldom(64)])
 def test_the_network_in_parts_is_the_network(tall, rows):
     pytest.importorskip("torch")
     from hybrid.neural import open_network
@@ -540,28 +509,7 @@ def test_little_memory_gives_the_same_bytes(tall, tmp_path, monkeypatch):
     assert contents(tmp_path / "whole") == contents(tmp_path / "parts")
 
 
-FAULTS = """
-import resource
-from hybrid.runtime.allocator import reuse_freed_memory
-
-def page_faults() -> int:
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    bytearray(2**26)  # written, and freed
-    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
-
-first, again = page_faults(), page_faults()
-reuse_freed_memory()
-page_faults()
-print(first, again, page_faults())
-"""
-
-
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc's allocator is spoken to")
-def test_memory_that_is_kept_is_not_fetched_page_by_page():
-    first, again, kept = (int(word) for word in run_alone("-c", FAULTS).stdout.split())
-    assert min(first, again) > 10 * max(kept, 1)
-
-
+@pytest.mark.reliability
 def test_one_thread_or_two_give_the_same_bytes(tmp_path):
     folder = Scene(height=80, width=96).write(tmp_path / "in")
     for count in ("1", "2"):

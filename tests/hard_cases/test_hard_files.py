@@ -1,7 +1,5 @@
 """Files: damaged, enormous, of odd kinds, and with names that were chosen to do harm."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess
@@ -160,22 +158,6 @@ def test_every_relation_of_the_windows_is_kept(tmp_path, windows):
     for name in ("data_window", "display_window"):
         assert getattr(kept.parts[0], name) == getattr(read_exr(path).parts[0], name)
     np.testing.assert_array_equal(kept.channel("A"), channels["A"])
-
-
-def test_tiled_files_stay_tiled(tmp_path):
-    tiles = OpenEXR.TileDescription()
-    tiles.xSize = tiles.ySize = 8
-    rng = np.random.default_rng(0)
-    path = save(
-        tmp_path / "a.exr",
-        {c: rng.random((20, 28)).astype(np.float16) for c in "RGB"},
-        type=OpenEXR.tiledimage,
-        tiles=tiles,
-    )
-    assert main(["denoise", str(path), "-o", str(tmp_path / "out" / "a.exr"), "--preset", "draft"]) == 0
-    header = read_exr(tmp_path / "out" / "a.exr", pixels=False).parts[0].header
-    assert header["type"] == OpenEXR.tiledimage
-    assert header["tiles"].xSize == 8
 
 
 @pytest.mark.posix

@@ -1,9 +1,7 @@
 """Commands that are killed, stopped, starved and doubled at random moments: --resume gives the bytes of one run.
 
-The classical chain belongs to the quick tests, the network to `pytest -m reliability`.
+A few of them with the classical chain belong to the quick tests, the others to `pytest -m reliability`.
 """
-
-from __future__ import annotations
 
 import os
 import random
@@ -24,10 +22,11 @@ from hybrid.records import FOLDER
 from loops import parallel
 from tests.commands import Done, start
 from tests.scenes import Scene
+from tests.seldom import seldom
 
 pytestmark = pytest.mark.posix
 SCENE = Scene(height=64, width=96, frames=6)
-KILLS, STOPS = 50, 10
+STOPS = 10
 NOBODY = 65534
 FULL = 40_000  # bytes that a file may have, where space is to be short: less than a frame
 
@@ -102,11 +101,12 @@ def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
         yield Bench(Path(name), request.param.split())
 
 
-def test_kills_at_random_moments_lose_nothing(bench, record_property):
+@pytest.mark.parametrize("kills", [10, *seldom(50)])
+def test_kills_at_random_moments_lose_nothing(bench, record_property, kills):
     """After each kill the frames that are there are those of an undisturbed run, to the byte."""
     rng = random.Random(0)
-    ended, output = 0, bench.folder / "killed.0"
-    for _ in range(KILLS):
+    ended, output = 0, bench.folder / f"killed.{kills}.0"
+    for _ in range(kills):
         process = bench.start(output, "--resume")
         process.join(rng.uniform(0, 1.1) * bench.seconds)
         process.kill()
@@ -114,11 +114,11 @@ def test_kills_at_random_moments_lose_nothing(bench, record_property):
         bench.check(output, complete=process.exitcode == 0)
         if process.exitcode == 0:
             ended += 1
-            output = bench.folder / f"killed.{ended}"
+            output = bench.folder / f"killed.{kills}.{ended}"
     bench.run(output, "--resume").succeeds()
     bench.check(output, complete=True, tidy=True)
-    assert ended < 0.8 * KILLS  # else nothing was tried
-    record_property("cases", KILLS)
+    assert ended < 0.8 * kills  # else nothing was tried
+    record_property("cases", kills)
 
 
 def test_a_kill_while_threads_start_does_not_block_the_next_run(bench):
@@ -128,7 +128,7 @@ def test_a_kill_while_threads_start_does_not_block_the_next_run(bench):
     bench.check(bench.folder / "blocked", complete=True, tidy=True)
 
 
-@pytest.mark.parametrize("number", range(STOPS))
+@pytest.mark.parametrize("number", [0, 1, *seldom(*range(2, STOPS))])
 def test_a_stop_leaves_whole_frames_and_says_how_many(bench, number):
     output = bench.folder / f"stopped.{number}"
     bench.said.write_bytes(b"")
@@ -193,9 +193,8 @@ def test_an_output_over_its_input(bench):
 
 
 def test_two_runs_at_once_into_one_folder(bench):
-    for number in range(3):
-        output = bench.folder / f"twice.{number}"
-        processes = [bench.start(output), bench.start(output)]
-        bench.join(*processes)
-        assert [process.exitcode for process in processes] == [0, 0]
-        bench.check(output, complete=True, tidy=True)
+    output = bench.folder / "twice"
+    processes = [bench.start(output), bench.start(output)]
+    bench.join(*processes)
+    assert [process.exitcode for process in processes] == [0, 0]
+    bench.check(output, complete=True, tidy=True)

@@ -1,5 +1,7 @@
 """Radiance at its extremes: any exposure, none at all, fireflies, cuts; variance and guides that tell nothing."""
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 import pytest
@@ -22,8 +24,9 @@ from tests.hard_cases.hard import (
     within_range,
 )
 from tests.scenes import Scene
+from tests.seldom import seldom
 
-SCALES = [1e-6, 1e-3, 1e3, 1e6]
+SCALES = [1e-6, 1e6]
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +104,7 @@ def test_frames_beside_a_black_one_scale_with_the_light(options):
 
 @pytest.mark.neural
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
-@pytest.mark.parametrize("scale", [0, 1e-42, 1e-38, 1e-30])
+@pytest.mark.parametrize("scale", [0, 1e-42, *seldom(1e-38)])
 def test_next_to_no_light_is_finite(network, precision, scale):
     """The reciprocal of a denormal exposure was infinite, and the picture NaN."""
     frames = shot(scale=scale)
@@ -179,17 +182,25 @@ def test_a_cut_inside_the_window_mixes_no_scenes():
 # --- fireflies
 
 
+burning = pytest.mark.parametrize("value", [1e6, *seldom(6.5e4)])
+
+
+@lru_cache
+def unburnt(preset):
+    return denoise(shot(), preset)[1]
+
+
 def burn(frames, value, size, which):
     for index in which:
         frames[index].color[20 : 20 + size, 28 : 28 + size] = value
     return frames
 
 
-@pytest.mark.parametrize("value", [6.5e4, 1e6])
+@burning
 @pytest.mark.parametrize("which", [(MIDDLE,), (MIDDLE - 1,), (MIDDLE - 1, MIDDLE)], ids=["centre", "side", "both"])
 def test_a_firefly_leaves_neither_hole_nor_halo(value, which, record_property):
     for preset in CLASSICAL_PRESETS:
-        plain = denoise(shot(), preset)[1]
+        plain = unburnt(preset)
         image = denoise(burn(shot(), value, 1, which), preset)[1]
         clean = truth()
         for reach in (0, 1, 2, 4):
@@ -213,7 +224,7 @@ def ring_error(image, clean, size, near, far):
     return abs(image[ring].mean() / clean[ring].mean() - 1), 4 * 0.3 / np.sqrt(ring.sum())
 
 
-@pytest.mark.parametrize("value", [6.5e4, 1e6])
+@burning
 @pytest.mark.parametrize("which", [(MIDDLE,), (MIDDLE - 1,)], ids=["centre", "side"])
 def test_four_fireflies_together_leave_no_halo(value, which, record_property):
     """They passed for an object, and the non-local means left a thousand times the light three pixels away."""
@@ -225,7 +236,7 @@ def test_four_fireflies_together_leave_no_halo(value, which, record_property):
     record_property("cases", 3 * len(CLASSICAL_PRESETS))
 
 
-@pytest.mark.parametrize("value", [6.5e4, 1e6])
+@burning
 def test_what_may_be_an_object_does_not_leak_beyond_the_reach(value, record_property):
     """Nine bright pixels, or four in two frames, stay; a little of them is smeared over the reach of the filters."""
     for preset in CLASSICAL_PRESETS:
@@ -241,13 +252,12 @@ def test_what_may_be_an_object_does_not_leak_beyond_the_reach(value, record_prop
 @pytest.mark.neural
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 def test_the_network_survives_fireflies(network, precision, record_property):
-    for value in (6.5e4, 1e6):
-        for size in (1, 2, 3):
-            frames = burn(shot(), value, size, (MIDDLE - 1, MIDDLE))
-            image = network[precision](align(frames, first_pass=Classical(STANDARD))).color
-            assert np.isfinite(image).all()
-            assert (image >= 0).all()
-    record_property("cases", 6)
+    for size in (1, 3):
+        frames = burn(shot(), 1e6, size, (MIDDLE - 1, MIDDLE))
+        image = network[precision](align(frames, first_pass=Classical(STANDARD))).color
+        assert np.isfinite(image).all()
+        assert (image >= 0).all()
+    record_property("cases", 2)
 
 
 def test_negative_radiance_stays_in_its_neighbourhood():
@@ -295,10 +305,9 @@ GUIDES = {
 
 
 @pytest.mark.parametrize("changes", GUIDES.values(), ids=GUIDES)
-@pytest.mark.parametrize("preset", ["draft", "standard"])
-def test_guides_that_tell_nothing_do_no_harm(changes, preset):
+def test_guides_that_tell_nothing_do_no_harm(changes):
     frames = [spoil(f, **{name: change(f) for name, change in changes.items()}) for f in shot()]
-    window, image = denoise(frames, preset)
+    window, image = denoise(frames)
     assert np.isfinite(image).all()
     assert (image >= 0).all()
     assert within_range(window, image)
@@ -311,7 +320,3 @@ def test_alpha_of_nought_stays_nought(network):
     done = network["float32"](window)
     assert (done.aovs["alpha"] == 0).all()
     assert np.isfinite(done.color).all()
-
-
-def test_the_picture_does_not_depend_on_when_it_is_made():
-    np.testing.assert_array_equal(denoise(shot())[1], denoise(shot())[1])

@@ -1,11 +1,11 @@
 """Kernels, losses, metrics and the network at their limits: finite, normalised, local."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from tests.seldom import seldom
 
 torch = pytest.importorskip("torch")
 
@@ -146,7 +146,7 @@ def hard_window(level: float) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.parametrize("preset", ["balanced", "unet"])
-@pytest.mark.parametrize("level", [0.0, 1e-42, 1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("level", [0.0, 1e-42, 1e6])
 def test_the_gradient_of_the_whole_network_is_finite(level, preset):
     model, window = build_preset(preset), hard_window(level)
     image = run(model, window)
@@ -157,7 +157,7 @@ def test_the_gradient_of_the_whole_network_is_finite(level, preset):
     assert all(bool(torch.isfinite(gradient).all()) for gradient in gradients)
 
 
-@pytest.mark.parametrize("bfloat16", [False, True], ids=["float32", "bfloat16"])
+@pytest.mark.parametrize("bfloat16", [False, *seldom(True)], ids=["float32", "bfloat16"])
 @pytest.mark.parametrize("preset", [None, "balanced", "quality"], ids=["unet", "balanced", "quality"])
 def test_a_firefly_changes_little_around_it_and_nothing_far_away(preset, bfloat16):
     """92 pixels are what a unet can see in theory, 112 what a trunk can."""
@@ -167,10 +167,10 @@ def test_a_firefly_changes_little_around_it_and_nothing_far_away(preset, bfloat1
     else:
         model = robust_unet.for_inference(load_model(shipped_weights(preset)), bfloat16)
     frames = model.frames
-    color, half = torch.rand(1, frames, 3, 64, 512), torch.full((1,), 0.5)
-    estimate, confidence = torch.full_like(color, 0.5), torch.ones(1, frames, 1, 64, 512)
+    color, half = torch.rand(1, frames, 3, 48, 192), torch.full((1,), 0.5)
+    estimate, confidence = torch.full_like(color, 0.5), torch.ones(1, frames, 1, 48, 192)
     window = {"color": color, "estimate": estimate, "confidence": confidence, "exposure": half, "gain": half}
-    window |= {"residual": color - estimate, "modulation": torch.ones(1, 3, 64, 512)}
+    window |= {"residual": color - estimate, "modulation": torch.ones(1, 3, 48, 192)}
     with torch.inference_mode():
         plain = run(model, window)
     for name in ("color", "residual"):

@@ -1,7 +1,5 @@
 """Every public stage of flow and nlm, on arrays with anything in them: finite, in range, never a warning turned NaN."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -9,14 +7,7 @@ from hypothesis import strategies as st
 
 from flow.confidence import estimate_confidence, mix_centre
 from flow.guide import Guide, estimate_noise, make_guide, pair_guides
-from flow.motion import (
-    CYCLES,
-    MotionConvention,
-    compose_flow,
-    forward_backward_error,
-    invert_flow,
-    normalize_motion,
-)
+from flow.motion import CYCLES, MotionConvention, compose_flow, forward_backward_error, invert_flow, normalize_motion
 from flow.selection import select_flow
 from flow.tvl1 import dense_flow, refine_flow
 from flow.warp import warp
@@ -28,7 +19,7 @@ from nlm.guided import guided_filter
 from nlm.nonlocal_means import joint_nlm
 from nlm.relight import relight
 
-EXAMPLES = 40
+EXAMPLES = 20
 anything = settings(
     max_examples=EXAMPLES, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )

@@ -1,7 +1,5 @@
 """Weights files that are damaged, foreign or hostile: one line that says what, and nothing is run."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import tracemalloc
@@ -49,19 +47,9 @@ def write(path, model=None, **metadata):
     return path
 
 
-def test_cut_anywhere_it_is_refused(tmp_path, good, record_property):
-    path = tmp_path / "cut.safetensors"
-    lengths = [0, 1, 7, 8, 9, 100, len(good) // 2, len(good) - 1]
-    for length in lengths:
-        path.write_bytes(good[:length])
-        with pytest.raises(ValueError, match="cut short"):
-            load_model(path)
-    record_property("cases", len(lengths))
-
-
 def test_a_flipped_bit_is_refused_or_gives_a_finite_model(tmp_path, good, record_property):
     path = tmp_path / "flipped.safetensors"
-    positions = range(0, 4000, 40)  # the header
+    positions = range(0, 4000, 200)  # the header
     for position in positions:
         data = bytearray(good)
         data[position] ^= 1 << position % 8
@@ -107,6 +95,8 @@ def test_pickles_are_not_opened(tmp_path):
         ({"description": "[]"}, "description"),
         ({"description": "null"}, "description"),
         ({"description": "[" * 100_000}, "recursion|Expecting|nest"),
+        ({"description": '{"a":' * 100_000}, "recursion|Expecting|nest"),
+        ({"description": "1e999"}, "description"),
         ({"description": json.dumps({"model": "os.system", "config": {}})}, "description"),
         ({"description": json.dumps(describe(build_preset("paper")))}, "expected shape"),
     ],
@@ -146,7 +136,7 @@ def test_hostile_sizes_are_refused_before_anything_is_built(tmp_path, changes):
 
 @pytest.mark.parametrize(
     "changes",
-    [{"widths": [2**40]}, {"frames": 10**9 + 1}, {"frames": 5.0}, {"threshold": 2}],
+    [{"widths": [2**40]}, {"frames": 10**9 + 1}, {"frames": 5.0}, {"threshold": 2}, {"cell": 0}, {"cell": 10**6}],
     ids=str,
 )
 def test_hostile_sizes_beside_estimates_too(tmp_path, changes):
@@ -180,12 +170,13 @@ def test_descriptions_that_nest_are_refused_before_anything_is_built(tmp_path, d
     [
         ("paper", {"conv_size": 99}, "conv_size: expected a number up to 15, got 99"),
         ("paper", {"blocks": 255}, "blocks: expected a number up to 64"),
+        ("tkpcn", {"temporal_blocks": 255}, "temporal_blocks: expected a number up to 16"),
         ("paper", {"width": 10**400}, "width: expected a number up to 256, got 1000"),
         ("balanced", {"frames": 255}, "frames: expected a number up to 15, got 255"),
         ("unet", {"widths": [256] * 250}, "expected shape|widths"),
         ("unet", {"kernel": {"frames": 5, "size": 255, "threshold": 0.5, "activation": "relu"}}, "size: expected"),
     ],
-    ids=["conv_size", "blocks", "digits", "frames", "widths", "size"],
+    ids=["conv_size", "blocks", "temporal", "digits", "frames", "widths", "size"],
 )
 def test_what_would_take_for_ever_to_run_is_refused_too(tmp_path, model, changes, word):
     described = describe(build_preset(model))
