@@ -1,7 +1,5 @@
 """Shots that something is done to, and what is found in files afterwards."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -3,8 +3,6 @@
 Noise of 20 %, that of a path tracer, over a wall whose truth is known, for a network and the classical chain.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -5,8 +5,6 @@ its own; of several frames one is read and one is written meanwhile, as in a chu
 operating system's count of that process. ``pytest -rP`` shows it.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -5,8 +5,6 @@ camera that stands still while its light changes, an object of 2 % of the frame 
 textured guides. Noise is unbiased, skewed and independent between frames.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

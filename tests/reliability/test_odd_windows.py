@@ -4,8 +4,6 @@ Each shot is calm but for one event. Seven frames around it are denoised twice. 
 that move: a flow that is found in noise guards against nothing, and blurs.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,10 +1,7 @@
-"""No picture is silently wrong: rows 1, 2, 4, 5, 14 and 21 of docs/dev/reliability.md."""
+"""No picture is silently wrong: rows 1, 5, 14 and 21 of docs/dev/reliability.md."""
 
 # ruff: noqa: E501 - tables of cases, one a line
 
-from __future__ import annotations
-
-import json
 import os
 import re
 from collections.abc import Callable, Sequence
@@ -16,7 +13,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from tests.commands import ROOT, ravg
+from tests.commands import ravg
 from tests.reliability.shots import (
     ALBEDO,
     COLOR,
@@ -27,8 +24,6 @@ from tests.reliability.shots import (
     VECTOR,
     Edit,
     Layers,
-    assert_no_worse,
-    blurred,
     cases,
     color,
     draft,
@@ -40,7 +35,6 @@ from tests.reliability.shots import (
     wall,
     write,
 )
-from tests.scenes import grained
 
 pytestmark = [pytest.mark.reliability, pytest.mark.posix]
 
@@ -88,38 +82,12 @@ def sparks(count: int, value: float = 5000) -> Edit:
 # Event → changes before and after noise.
 EVENTS: dict[str, tuple[Edit | None, Edit | None]] = {
     "a frame five times brighter": (flare(5), None),
-    "a frame at a fifth of its light": (flare(0.2), None),
     "a light switched down": (switch(0.2), None),
-    "a light switched on": (switch(5), None),
     "half of a frame four times brighter": (flare(4, slice(0, SIZE[0] // 2)), None),
-    "a tenth of a frame darker": (flare(0.2, slice(0, 4)), None),
     "a burst of motion": (burst, None),
     "a cut": (cut, None),
-    "a firefly": (None, sparks(1)),
     "five fireflies": (None, sparks(5, 800)),
 }
-FORCED = "--stages", "warp", "--stages", "gate", "--stages", "outliers"
-
-
-@cases((False, True), "estimates")
-@cases(EVENTS, "event")
-def test_no_frame_is_worse_than_with_every_guard_forced_on(folder, event, estimates):
-    """By more than 0.2 dB or 1 % of its mean."""
-    noisy, clean = shot(folder / "in", 18, *event), shot(folder / "clean", 18, *event, noise=0)
-    more = ["--first-pass", blurred(folder / "single", noisy)] if estimates else []
-    for out, forced in (("planned", ()), ("forced", FORCED)):
-        done = ravg("denoise", noisy, "-o", folder / out, "--method", "classical", *more, *forced)
-        if estimates and re.search(rf"error: the .* of frame {1001 + ODD}: it has", done.said):
-            return  # an estimate that has spread a firefly's light all over a small picture is refused
-        done.succeeds()
-    for index in range(ODD - 3, ODD + 4):
-        name = f"shot.{1001 + index:04d}.exr"
-        truth = color(clean / name)
-        if truth.max() > 100:  # the firefly is in it
-            truth = color(clean / "shot.1001.exr")
-        planned, forced = (color(folder / out / name) for out in ("planned", "forced"))
-        assert_no_worse(planned, forced, truth, name)
-        assert 0.8 < planned.mean() / truth.mean() < 1.25, name
 
 
 @cases(EVENTS, "event")
@@ -128,104 +96,6 @@ def test_a_frame_is_the_same_in_chunks(folder, event):
     for out, frames in (("all", "1001-1018"), ("part", "1005-1007"), ("part", "1008")):
         ravg("denoise", noisy, "-o", folder / out, *DRAFT, "--frames", frames).succeeds()
     same(folder / "part", folder / "all")
-
-
-@pytest.mark.parametrize(
-    ("edit", "late", "stage", "frames"),
-    [
-        (burst, None, "warp", "1006-1011"),
-        (None, sparks(1), "fireflies", "1005-1009"),
-    ],
-    ids=["motion", "fireflies"],
-)
-def test_inspect_names_the_frames(folder, edit, late, stage, frames):
-    said = ravg("inspect", shot(folder, 18, edit, late)).words
-    assert frames in " ".join(said[said.find(stage) :].split()[:60])
-
-
-# --- 2: absurd values make no picture; frames not made are no success
-
-
-@cases((1e15, 1e30, -1e30, 3e38), "value")
-@cases((COLOR, ALBEDO, NORMAL, VECTOR), "layer")
-def test_one_absurd_pixel_changes_no_frame(folder, layer, value):
-    def late(index: int, layers: Layers) -> None:
-        if index == 2:
-            layers[layer][10, 20] = value
-
-    for name, change in (("plain", None), ("absurd", late)):
-        noisy = shot(folder / f"{name} in", 5, late=change, step=(2, 1))
-        ravg("denoise", noisy, "-o", folder / name, *DRAFT).succeeds()
-    for name in sorted(names(folder / "plain")):
-        absurd, plain = color(folder / "absurd" / name), color(folder / "plain" / name)
-        assert np.isfinite(absurd).all()
-        assert abs(absurd.mean() / plain.mean() - 1) <= 0.05
-
-
-WRONG_ESTIMATES: dict[str, Callable[[np.ndarray], object]] = {
-    "nan": lambda x: x.fill(np.nan),
-    "half nan": lambda x: x[:16].fill(np.nan),
-    "of 1e30": lambda x: x.fill(1e30),
-    "black": lambda x: x.fill(0),
-    "four times too bright": lambda x: np.multiply(x, 4, out=x),
-    "without red": lambda x: x[..., 0].fill(0),
-}
-
-
-@cases(WRONG_ESTIMATES, "change")
-def test_an_estimate_that_cannot_be_right_is_refused_by_its_frame(folder, change):
-    estimates = blurred(folder / "single", shot(folder / "in", 5, step=(2, 1)))
-    layers = wall(2, (2, 1))
-    change(layers[COLOR])
-    write(estimates / "shot.1003.exr", layers)
-    done = ravg(*draft("--first-pass", "single"), folder=folder).is_refused()
-    assert "1003" in done.said
-
-
-@cases(("1001-1005", "1003", "1004-1009", "1-3,1004"), "asked")
-def test_frames_that_are_not_there_are_an_error(folder, asked):
-    (shot(folder / "in", 5) / "shot.1003.exr").unlink()
-    ravg(*draft("--frames", asked), folder=folder).is_refused()
-
-
-@pytest.mark.neural
-@cases((30.0, 300.0, -30.0), "factor")
-def test_absurd_weights_make_no_picture(folder, factor):
-    from safetensors import safe_open
-    from safetensors.numpy import save_file
-
-    with safe_open(ROOT / "network" / "weights" / "fast.safetensors", "np") as file:
-        tensors = {name: np.clip(file.get_tensor(name) * np.float16(factor), -6e4, 6e4) for name in file.keys()}  # noqa: SIM118
-        save_file(tensors, folder / "w.safetensors", file.metadata())
-    shot(folder / "in", 3, step=(2, 1))
-    done = ravg("denoise", "in", "-o", "out", "--first-pass", "nlm", "--weights", "w.safetensors", folder=folder)
-    for path in (folder / "out").glob("*.exr"):
-        made, given = color(path), color(folder / "in" / path.name)
-        assert np.isfinite(made).all()
-        assert 1 / 3 < made.mean() / given.mean() < 3
-    done.ends("either")
-
-
-# --- 4: one seed is told from detail
-
-
-@pytest.mark.parametrize(
-    ("samples", "moves", "fixed", "vectors", "number"),
-    list(product((16, 256, 4096), (False, True), (False, True), (True, False), (1, 2))),
-)
-def test_one_seed_is_told_from_detail(folder, samples, moves, fixed, vectors, number):
-    """Detail of a pixel's size correlates between frames as a fixed noise does."""
-    size, step = (96, 128), (3, 1) if moves else (0, 0)
-    detail = np.random.default_rng(number).uniform(0.5, 1.5, (200, 200, 1)).astype(np.float32)
-    for index in range(4):
-        layers = wall(index, step, size)
-        y, x = 40 - step[1] * index, 40 - step[0] * index
-        clean = layers[COLOR] * detail[y : y + 96, x : x + 128]
-        layers[COLOR] = grained(clean, (number, 0 if fixed else index), 2 / samples**0.5)
-        if not vectors:
-            del layers[VECTOR]
-        write(folder / f"shot.{1001 + index}.exr", layers)
-    assert ("one seed for all" in ravg("inspect", folder).words) == fixed
 
 
 # --- 5: what is opaque stays opaque
@@ -318,22 +188,6 @@ def test_a_lamp_of_one_pixel_stays(folder, step, value):
         y, x = 16 + step[1] * index, 20 + step[0] * index
         block = color(folder / "out" / f"shot.{1001 + index}.exr")[y - 3 : y + 4, x - 3 : x + 4]
         assert 0.5 * value < block.mean(axis=-1).sum() < 2 * value
-
-
-def test_light_that_is_taken_out_is_on_record(folder):
-    def late(index: int, layers: Layers) -> None:
-        if index == 1:
-            layers[COLOR][12, 16] = 5000
-
-    shot(folder / "in", 3, late=late)
-    ravg(*draft(), folder=folder).succeeds()
-    (record,) = (json.loads(path.read_text()) for path in (folder / "out").rglob("*.json"))
-    given = color(folder / "in" / "shot.1002.exr")
-    share = max(entry.get("light_removed", 0) for entry in record["frames"].values())
-    assert share == pytest.approx(5000 * 3 / given.sum(), rel=0.1)
-    assert record["mean"]["with_fireflies"] - record["mean"]["without"] == pytest.approx(
-        5000 / given[..., 0].size / 3, rel=0.1
-    )
 
 
 # --- 21: a frame that is not like the others

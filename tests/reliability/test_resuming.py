@@ -2,9 +2,6 @@
 
 # ruff: noqa: E501 - tables of cases, one a line
 
-from __future__ import annotations
-
-import json
 import os
 import re
 import shutil
@@ -23,7 +20,6 @@ import pytest
 from tests.commands import ROOT, Done, ravg, run_python
 from tests.reliability.shots import (
     ALBEDO,
-    COLOR,
     DRAFT,
     RAW,
     SIZE,
@@ -31,8 +27,6 @@ from tests.reliability.shots import (
     Layers,
     blurred,
     cases,
-    color,
-    contents,
     difference,
     draft,
     exchange,
@@ -43,12 +37,10 @@ from tests.reliability.shots import (
     render_again,
     same,
     shot,
-    unchanged,
     wall,
     weights,
     write,
 )
-from tests.scenes import grained
 
 pytestmark = [pytest.mark.reliability, pytest.mark.posix]
 
@@ -96,18 +88,9 @@ class Project:
 
 
 CHANGES: dict[str, Callable[[Project], object]] = {
-    "a frame rendered again": lambda p: render_again(p.frame(1004), later()),
-    "a frame rendered again, of an older time": lambda p: render_again(p.frame(1004), 1e9),
-    "a frame rendered again, of the same time and size": lambda p: render_again(p.frame(1004)),
     "the last frame rendered again, of the same time": lambda p: render_again(p.frame(1008)),
     "two frames swapped": lambda p: exchange(p.frame(1003), p.frame(1006)),
-    "a frame that is gone": lambda p: p.frame(1008).unlink(),
-    "estimates made again": lambda p: [render_again(x, later()) for x in p.first_pass.iterdir()],
-    "an older estimate": lambda p: render_again(p.first_pass / "shot.1004.exr", 1e9),
-    "an estimate of the same time and size": lambda p: render_again(p.first_pass / "shot.1004.exr"),
     "noisy frames as estimates": lambda p: [shutil.copy2(x, p.first_pass / x.name) for x in p.frames.iterdir()],
-    "an output that is another frame's": lambda p: shutil.copy2(p.out / "shot.1005.exr", p.out / "shot.1004.exr"),
-    "an output cut short": lambda p: os.truncate(p.out / "shot.1004.exr", 3000),
     "an empty output": lambda p: os.truncate(p.out / "shot.1004.exr", 0),
     "an output that is an input": lambda p: shutil.copy2(p.frame(1004), p.out / "shot.1004.exr"),
 }
@@ -119,18 +102,6 @@ def test_resume_after_a_change(folder, change):
     project.write(8)
     project.run(project.out)
     change(project)
-    project.resumes_as_fresh()
-
-
-@cases((None, 1e9), "seconds")
-def test_resume_with_a_neighbour_that_comes_late(folder, seconds):
-    project = Project(folder)
-    project.write(8)
-    project.frame(1004).rename(folder / "late.exr")
-    project.run(project.out)
-    (folder / "late.exr").rename(project.frame(1004))
-    if seconds is not None:
-        os.utime(project.frame(1004), (seconds, seconds))
     project.resumes_as_fresh()
 
 
@@ -153,41 +124,6 @@ def test_resume_with_other_options(folder, more):
     project.resumes_as_fresh(*more)
 
 
-@pytest.mark.neural
-def test_resume_with_other_weights_under_one_name_and_of_one_time(folder):
-    shot(folder / "in", 3, step=(2, 1))
-    words = ["denoise", "in", "--first-pass", "nlm", "--weights", "w.safetensors"]
-    for name, outs in (("fast", ["out"]), ("balanced", ["out", "fresh"])):
-        os.utime(weights(folder, ROOT, name), (1e9, 1e9))
-        for out in outs:
-            ravg(*words, "-o", out, "--resume", folder=folder).succeeds()
-    same(folder / "fresh", folder / "out")
-
-
-def test_resume_says_why(folder):
-    project = Project(folder)
-    project.write(5)
-    project.run(project.out)
-    render_again(project.first_pass / "shot.1003.exr", 1e9)
-    said = project.run(project.out, "--resume").said
-    assert "made again" in said
-    assert "shot.1003.exr" in said
-
-
-@cases((False, True), "elsewhere")
-def test_resume_leaves_alone_what_is_the_same(folder, elsewhere):
-    project = Project(folder)
-    project.write(4)
-    project.run(project.out)
-    stamps = {path: path.stat().st_mtime_ns for path in project.out.glob("*.exr")}
-    if elsewhere:
-        (folder / "elsewhere").mkdir()
-        for path in (project.frames, project.first_pass):
-            path.rename(folder / "elsewhere" / path.name)
-    Project(folder / "elsewhere" if elsewhere else folder).run(project.out, "--resume")
-    assert stamps == {path: path.stat().st_mtime_ns for path in stamps}
-
-
 # --- 7: kept estimates are those that would be made
 
 
@@ -202,22 +138,10 @@ def kept(folder: Path, first: Sequence[str], then: Sequence[str], change: Callab
         same(folder / "fresh", folder / "out")
 
 
-MODES = {"oidn": "oidn-best", "oidn-best": "oidn", "oidn-fast": "oidn-clean", "oidn-clean": "oidn"}
-
-
-@pytest.mark.oidn
-@pytest.mark.parametrize(("first", "then"), MODES.items())
-def test_kept_estimates_of_another_mode(folder, first, then):
-    kept(folder, ["--first-pass", first], ["--first-pass", then])
-
-
 KEPT: dict[str, Callable[[Path], object]] = {
-    "a frame rendered again": lambda f: render_again(f / "in/shot.1002.exr", later()),
-    "a frame of an older time": lambda f: render_again(f / "in/shot.1002.exr", 1e9),
     "a frame of the same time and size": lambda f: render_again(f / "in/shot.1002.exr"),
     "a kept picture cut short": lambda f: os.truncate(f / "kept/shot.1002.exr", 2000),
     "a kept picture of another frame": lambda f: shutil.copy2(f / "kept/shot.1001.exr", f / "kept/shot.1002.exr"),
-    "somebody else's picture in its place": lambda f: shutil.copy2(f / "in/shot.1002.exr", f / "kept/shot.1002.exr"),
     "the output in its place": lambda f: shutil.copy2(f / "first/shot.1002.exr", f / "kept/shot.1002.exr"),
 }
 FAST = ["--first-pass", "oidn-fast"]
@@ -227,35 +151,6 @@ FAST = ["--first-pass", "oidn-fast"]
 @cases(KEPT, "change")
 def test_kept_estimates_after_a_change(folder, change):
     kept(folder, FAST, FAST, change)
-
-
-@pytest.mark.oidn
-def test_kept_estimates_of_another_albedo(folder):
-    kept(folder, FAST, [*FAST, "--layer", "albedo=Denoising Normal"])
-
-
-def linked_output(folder: Path) -> Path:
-    (folder / "out").mkdir()
-    (folder / "link").symlink_to(folder / "out")
-    return folder / "link"
-
-
-PLACES: dict[str, Callable[[Path], Path]] = {
-    "in the output": lambda f: f / "out",
-    "in the output, by a link": linked_output,
-    "in the input": lambda f: f / "in",
-    "among another shot's frames": lambda f: shot(f / "other", 4, noise=0.1),
-}
-
-
-@pytest.mark.oidn
-@cases(PLACES, "place")
-def test_kept_estimates_are_written_over_nobodys_file(folder, place):
-    shot(folder / "in", 4)
-    where = place(folder)
-    before = contents(folder)
-    ravg(*draft(*FAST, "--keep-first-pass", where), folder=folder).is_refused()
-    unchanged(before)
 
 
 # --- 15: resuming with another option, profile, layer or weights
@@ -310,7 +205,6 @@ Other = tuple[Sequence[str], Sequence[str], Callable[[Path], object]]
 ELSEWHERE = ["--layer", "albedo=albedo/####.exr"]
 PROFILE = ["--profile", "mine.toml"]
 OTHERS: dict[str, Other] = {
-    "--motion none": ([], ["--motion", "none"], nothing),
     "--motion next": ([], ["--motion", "next,y-up"], nothing),
     "--motion, another scale": (["--motion", "both,y-up"], ["--motion", "both,y-up,scale=2"], nothing),
     "a profile instead of none": ([], PROFILE, nothing),
@@ -322,10 +216,8 @@ OTHERS: dict[str, Other] = {
     "every second frame first": (["--frames", "1001-1005x2"], [], nothing),
     "with and without --max-memory": (["--max-memory", "4G"], [], nothing),
     "frames renumbered by one": ([], [], renumber),
-    "the first frame gone": ([], [], lambda f: (f / "in/shot.1001.exr").unlink()),
     "a frame in the middle gone": ([], [], lambda f: (f / "in/shot.1003.exr").unlink()),
     "another compression, the same pixels": ([], [], lambda f: write(f / "in/shot.1002.exr", read_layers(f / "in/shot.1002.exr"))),
-    "outputs that were exchanged": ([], [], lambda f: exchange(f / "out/shot.1002.exr", f / "out/shot.1005.exr")),
     "an output made read-only": ([], ["--no-stages", "gate"], lambda f: os.chmod(f / "out/shot.1002.exr", 0o444)),
 }  # fmt: skip
 NETWORK: dict[str, Other] = {
@@ -334,7 +226,6 @@ NETWORK: dict[str, Other] = {
     "two passes": ([], ["--passes", "2"], nothing),
     "two passes, and a frame rendered again": (["--passes", "2"], ["--passes", "2"], lambda f: render_again(f / "in/shot.1001.exr")),
     "two passes, and then one": (["--passes", "2"], [], nothing),
-    "other weights under one name": ([], [], lambda f: weights(f, ROOT, "quality")),
 }  # fmt: skip
 
 
@@ -502,65 +393,7 @@ def test_views_of_a_pattern_are_made_each_by_itself(folder, case):
     same(folder / "fresh", folder / "out")
 
 
-@cases(("out.####.exr", "in/shot.%V.####.exr", "out.exr"), "output")
-def test_two_views_in_one_place_are_refused(folder, output):
-    two_views(folder, 2)
-    ravg("denoise", "in/shot.%V.####.exr", *DRAFT, "-o", output, folder=folder).is_refused()
-
-
-def test_two_views_in_one_file_are_both_denoised(folder):
-    def edit(index: int, layers: Layers) -> None:
-        for name in list(layers):
-            layer = layers.pop(name)
-            for seed, view in enumerate(("left", "right")):
-                layers[f"{name}.{view}"] = grained(layer, (index, seed)) if name == COLOR else layer
-
-    shot(folder / "in", 3, edit, step=(2, 1))
-    for more in ([], ["--resume"]):
-        ravg(*draft(*more), folder=folder).succeeds()
-    for view in ("left", "right"):
-        before, after = (color(folder / x / "shot.1002.exr", f"{COLOR}.{view}") for x in ("in", "out"))
-        assert not np.array_equal(before, after)
-
-
 # --- 24: two things taken for one
-
-FOR_BOTH = [
-    ["--keep-first-pass", "kept", "--first-pass", "oidn-fast"],
-    ["--preview", "x.png"],
-    ["--contact-sheet", "x.png"],
-    ["--first-pass", "left/shot.####.exr"],
-    ["--layer", "albedo=left/shot.####.exr"],
-    ["-o", "out"],
-]
-
-
-@cases(FOR_BOTH, "more")
-def test_what_is_given_once_for_two_views_is_refused(folder, more):
-    for view in ("left", "right"):
-        shot(folder / view, 3)
-    output = [] if "-o" in more else ["-o", "out/%V"]
-    ravg("denoise", "%V/shot.####.exr", *DRAFT, *more, *output, folder=folder).is_refused()
-
-
-@pytest.mark.oidn
-def test_estimates_of_view_layers_called_alike_are_kept_apart(folder):
-    def edit(index: int, layers: Layers) -> None:
-        for name in list(layers):
-            layer = layers.pop(name)
-            layers |= {name.replace("ViewLayer", other): layer.copy() for other in ("A B", "A_B")}
-
-    shot(folder / "in", 2, edit)
-    ravg(*draft(*FAST, "--keep-first-pass", "kept"), folder=folder).succeeds()
-    assert len([*(folder / "kept").rglob("*.exr")]) == 4
-
-
-@cases((-1, 0, 1), "by")
-def test_estimates_of_neighbouring_frames_are_refused(folder, by):
-    shot(folder / "in", 6, step=(3, 1))
-    for index in range(6):
-        write(folder / "single" / f"shot.{1001 + index}.exr", {COLOR: wall(index + by, (3, 1))[COLOR]})
-    ravg(*draft("--first-pass", "single"), folder=folder).ends("refused" if by else "works")
 
 
 @cases(("1001-1007", "1003-1006", "1005"), "frames")
@@ -571,26 +404,6 @@ def test_every_second_frame_is_the_same_whatever_range_is_asked_for(folder, fram
     ravg("denoise", "in", "-o", "all", *DRAFT, folder=folder).succeeds()
     ravg("denoise", "in", "-o", "part", *DRAFT, "--frames", frames, "--keep-going", folder=folder)
     same(folder / "part", folder / "all")
-
-
-PROGRAM = """
-import json, sys
-from ravg import denoise_shot, open_shot
-out, options = sys.argv[1], json.loads(sys.argv[2])
-print(sum(not frame.resumed for frame in denoise_shot(open_shot("in"), out, resume=True, **options)))
-"""
-
-NETWORK_OPTIONS = {"preset": "fast", "weights": "w.safetensors"}
-
-
-@cases(({"no_stages": ["warp"]}, {"stages": ["refine"]}, {"first_pass": "nlm"}, NETWORK_OPTIONS), "then")
-def test_a_program_resumes_by_its_options(folder, then):
-    shot(folder / "in", 3, step=(2, 1))
-    shutil.copy(ROOT / "tests" / "data" / "small.safetensors", folder / "w.safetensors")
-    first: dict[str, object] = {"preset": "draft"}
-    for out, options in (("out", first), ("out", first | then), ("fresh", first | then)):
-        run_python("-c", PROGRAM, out, json.dumps(options), folder=folder).succeeds()
-    same(folder / "fresh", folder / "out")
 
 
 def test_a_frame_that_is_exchanged_while_it_is_used_ends_the_run(folder):
