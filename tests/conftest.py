@@ -2,8 +2,6 @@
 
 # ruff: noqa: E402 - the libraries read their numbers of threads when they are imported
 
-from __future__ import annotations
-
 import os
 
 # The pictures are small: threads gain nothing, and on a busy machine they wait for each other, ten times as long.
@@ -15,8 +13,12 @@ for _name in [name for name in os.environ if name.startswith("RAVG_") and name !
 for _name in ("COLUMNS", "LINES", "FORCE_COLOR", "NO_COLOR", "PY_COLORS"):
     os.environ.pop(_name, None)
 os.environ["TERM"] = "xterm"
+# Files of tests need not outlive the machine: waiting for the disk took a tenth of the time.
+os.fsync = lambda descriptor: None
 
 import argparse
+import functools
+import importlib.metadata
 import re
 import shutil
 import signal
@@ -28,6 +30,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+# Versions of packages are in every header that is written, and none changes meanwhile.
+importlib.metadata.version = functools.cache(importlib.metadata.version)
 
 from tests.scenes import Scene
 
@@ -59,6 +64,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if sys.platform == "win32" and item.get_closest_marker("posix"):
             item.add_marker(pytest.mark.skip(reason="needs POSIX: pipes, signals, links or shells"))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Give all tests of a file to one process: what a file's fixtures make is made once."""
+    from xdist.scheduler import LoadFileScheduling
+
+    return LoadFileScheduling(config, log)
 
 
 @pytest.fixture
