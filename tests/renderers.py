@@ -1,7 +1,5 @@
 """One rendered shot, rewritten as other renderers would have written it: names, conventions, units, files."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -45,9 +43,9 @@ class Truth:
         return np.array(self.color.shape[1::-1], np.float32)
 
 
-def truths(frames: str | None = None) -> list[Truth]:
-    """The frames of the shot."""
-    shot = open_shot(SHOT / "noisy.####.exr", frames=frames)
+def truths(part: tuple[slice, slice] = np.s_[:, :]) -> list[Truth]:
+    """The frames of the shot, or a part of each."""
+    shot = open_shot(SHOT / "noisy.####.exr")
     found = []
     for number in shot.numbers:
         frame = shot.read(number)
@@ -55,18 +53,8 @@ def truths(frames: str | None = None) -> list[Truth]:
         assert frame.alpha is not None and frame.albedo is not None and frame.normal is not None  # noqa: PT018
         assert motion is not None and motion.to_previous is not None and motion.to_next is not None  # noqa: PT018
         assert frame.depth is not None
-        found.append(
-            Truth(
-                number,
-                frame.color,
-                frame.alpha,
-                frame.albedo,
-                frame.normal,
-                frame.depth,
-                motion.to_previous.flow,
-                motion.to_next.flow,
-            )
-        )
+        layers = frame.color, frame.alpha, frame.albedo, frame.normal, frame.depth
+        found.append(Truth(number, *(x[part] for x in (*layers, motion.to_previous.flow, motion.to_next.flow))))
     return found
 
 
@@ -168,251 +156,71 @@ def one(channels: Callable[[Truth], Channels]) -> Callable[[Truth], dict[str, Ch
 UP = np.array([1, -1], np.float32)
 
 RENDERERS = {
-    "cycles": Renderer(
-        "Cycles",
-        one(
-            lambda t: (
-                layer("ViewLayer.Combined", "RGBA", t.color, t.alpha)
-                | layer("ViewLayer.Denoising Albedo", "RGB", t.albedo)
-                | layer("ViewLayer.Denoising Normal", "XYZ", t.normal)
-                | layer("ViewLayer.Depth", "Z", t.depth)
-                | layer("ViewLayer.Vector", "XYZW", cycles_vector(t))
-            )
-        ),
-        direction="both",
-        attributes={"cycles.ViewLayer.samples": str(SAMPLES)},
-    ),
+    "cycles": Renderer("Cycles", one(lambda t: layer("ViewLayer.Combined", "RGBA", t.color, t.alpha)
+        | layer("ViewLayer.Denoising Albedo", "RGB", t.albedo) | layer("ViewLayer.Denoising Normal", "XYZ", t.normal)
+        | layer("ViewLayer.Depth", "Z", t.depth) | layer("ViewLayer.Vector", "XYZW", cycles_vector(t))),
+        direction="both", attributes={"cycles.ViewLayer.samples": str(SAMPLES)}),
     # A shutter of 180 degrees: vectors are half as long.
-    "arnold": Renderer(
-        "Arnold",
-        one(
-            lambda t: (
-                layer("", "RGBA", t.color, t.alpha)
-                | layer("denoise_albedo", "RGB", t.albedo)
-                | layer("N", "XYZ", t.normal)
-                | layer("", "Z", t.depth)
-                | layer("motionvector", "RG", 0.5 * t.following * UP)
-                | layer("variance", "RGB", t.variance)
-            )
-        ),
-        roles="albedo normal depth variance",
-        direction="next",
-        attributes={"arnold/version": "7.3"},
-    ),
-    "arnold, direction and length": Renderer(
-        "Arnold",
-        one(
-            lambda t: (
-                layer("", "RGBA", t.color, t.alpha)
-                | layer("denoise_albedo", "RGB", t.albedo)
-                | layer("N", "XYZ", t.normal)
-                | layer("motionvector", "RGB", magnitude(t.following * UP))
-            )
-        ),
-        roles="albedo normal",
-        direction="next",
-        attributes={"arnold/version": "7.3"},
-    ),
-    "renderman": Renderer(
-        "RenderMan",
-        one(
-            lambda t: (
-                layer("Ci", "rgb", t.color)
-                | layer("", "a", t.alpha)
-                | layer("albedo", "rgb", t.albedo)
-                | layer("normal", "rgb", t.normal)
-                | layer("zfiltered", "z", t.depth)
-                | layer("mse", "rgb", t.variance)
-                | layer("sampleCount", "y", np.full_like(t.alpha, SAMPLES))
-                | layer("forward", "rg", t.following * UP)
-                | layer("backward", "rg", t.previous * UP)
-            )
-        ),
-        roles="albedo normal depth variance",
-        direction="both",
-    ),
+    "arnold": Renderer("Arnold", one(lambda t: layer("", "RGBA", t.color, t.alpha)
+        | layer("denoise_albedo", "RGB", t.albedo) | layer("N", "XYZ", t.normal) | layer("", "Z", t.depth)
+        | layer("motionvector", "RG", 0.5 * t.following * UP) | layer("variance", "RGB", t.variance)),
+        roles="albedo normal depth variance", direction="next", attributes={"arnold/version": "7.3"}),
+    "arnold, direction and length": Renderer("Arnold", one(lambda t: layer("", "RGBA", t.color, t.alpha)
+        | layer("denoise_albedo", "RGB", t.albedo) | layer("N", "XYZ", t.normal)
+        | layer("motionvector", "RGB", magnitude(t.following * UP))), roles="albedo normal", direction="next",
+        attributes={"arnold/version": "7.3"}),
+    "renderman": Renderer("RenderMan", one(lambda t: layer("Ci", "rgb", t.color) | layer("", "a", t.alpha)
+        | layer("albedo", "rgb", t.albedo) | layer("normal", "rgb", t.normal) | layer("zfiltered", "z", t.depth)
+        | layer("mse", "rgb", t.variance) | layer("sampleCount", "y", np.full_like(t.alpha, SAMPLES))
+        | layer("forward", "rg", t.following * UP) | layer("backward", "rg", t.previous * UP)),
+        roles="albedo normal depth variance", direction="both"),
     # The beauty, and the denoiser's variance file beside it.
-    "renderman, apart": Renderer(
-        "RenderMan",
-        lambda t: {
-            "shot.####.exr": layer("Ci", "rgb", t.color) | layer("", "a", t.alpha),
-            "shot_variance.####.exr": layer("albedo", "rgb", t.albedo)
-            | layer("normal", "rgb", t.normal)
-            | layer("zfiltered", "z", t.depth)
-            | layer("mse", "rgb", t.variance)
-            | layer("sampleCount", "y", np.full_like(t.alpha, SAMPLES))
-            | layer("forward", "rg", t.following * UP)
-            | layer("backward", "rg", t.previous * UP),
-        },
-        roles="albedo normal depth variance",
-        direction="both",
-    ),
-    "vray": Renderer(
-        "V-Ray",
-        one(
-            lambda t: (
-                layer("", "RGBA", t.color, t.alpha)
-                | layer("diffuseFilter", "red,green,blue", t.albedo)
-                | layer("normals", "X,Y,Z", t.normal)
-                | {"zDepth": t.depth}
-                | layer("velocity", "RGB", t.following, t.depth * 0)
-            )
-        ),
-        direction="next",
-        attributes={"vrayInfo/camera": "cam"},
-    ),
-    "vray, prefixed": Renderer(
-        "V-Ray",
-        one(
-            lambda t: (
-                layer("", "RGBA", t.color, t.alpha)
-                | layer("VRayDiffuseFilter", "RGB", t.albedo)
-                | layer("VRayNormals", "RGB", t.normal)
-                | layer("VRayZDepth", "R", t.depth)
-                | layer("VRayVelocity", "RGB", t.following * UP, t.depth * 0)
-            )
-        ),
-        direction="next",
-    ),
-    "karma": Renderer(
-        "Karma",
-        one(
-            lambda t: (
-                layer("C", "RGBA", t.color, t.alpha)
-                | layer("albedo", "RGB", t.albedo)
-                | layer("N", "XYZ", t.normal)
-                | {"hitPz": t.depth}
-                | layer("motionvectors", "XYZ", t.following / t.size * UP, t.depth * 0)
-            )
-        ),
-        direction="next",
-        attributes={"husk:render_stats": "{}"},
-    ),
-    "redshift": Renderer(
-        "Redshift",
-        one(
-            lambda t: (
-                layer("", "RGBA", t.color, t.alpha)
-                | layer("DiffuseFilter", "RGB", t.albedo)
-                | layer("Normals", "RGB", t.normal)
-                | layer("Z", "Z", t.depth)
-                | layer("MotionVectors", "RG", t.following * UP)
-            )
-        ),
-        direction="next",
-    ),
-    "octane": Renderer(
-        "Octane",
-        one(
-            lambda t: (
-                layer("Beauty", "RGBA", t.color, t.alpha)
-                | layer("Diffuse filter info", "RGB", t.albedo)
-                | layer("Shading normal", "RGB", t.normal)
-                | layer("Z-depth", "Z", t.depth)
-                | layer("Motion vector", "RGB", t.following / t.size[0] * UP, t.depth * 0)
-            )
-        ),
-        direction="next",
-    ),
-    "mitsuba": Renderer(
-        "Mitsuba",
-        one(
-            lambda t: (
-                layer("my_image", "RGBA", t.color, t.alpha)
-                | layer("alb", "RGB", t.albedo)
-                | layer("nn", "XYZ", t.normal)
-                | layer("dd", "T", t.depth)
-            )
-        ),
-    ),
-    "pbrt": Renderer(
-        "pbrt",
-        one(
-            lambda t: (
-                layer("", "RGB", t.color)
-                | layer("Albedo", "RGB", t.albedo)
-                | layer("N", "XYZ", t.normal)
-                | layer("Ns", "XYZ", t.normal)
-                | layer("Variance", "RGB", t.variance * SAMPLES)
-                | layer("RelativeVariance", "RGB", t.variance)
-            )
-        ),
-        roles="albedo normal variance",
-        attributes={"samplesPerPixel": SAMPLES},
-    ),
-    "moonray": Renderer(
-        "MoonRay",
-        one(
-            lambda t: (
-                layer("", "RGBA", t.color, t.alpha)
-                | layer("albedo", "RGB", t.albedo)
-                | layer("normal", "XYZ", t.normal)
-                | {"depth": t.depth}
-                | layer("motionvec", "XY", t.following / t.size * 2 * UP * t.alpha[..., None])
-            )
-        ),
-        direction="next",
-    ),
-    "appleseed": Renderer(
-        "appleseed",
-        one(
-            lambda t: (
-                layer("beauty", "RGBA", t.color, t.alpha)
-                | layer("albedo", "RGB", t.albedo)
-                | layer("shading_normal", "RGB", t.normal)
-                | layer("depth", "Z", t.depth)
-                | layer("screen_space_velocity", "RGB", magnitude(t.following / t.size))
-            )
-        ),
-        direction="next",
-    ),
-    "nuke": Renderer(
-        "Nuke",
-        one(
-            lambda t: (
-                layer("", "RGBA", t.color, t.alpha)
-                | layer("albedo", "RGB", t.albedo)
-                | layer("normal", "XYZ", t.normal)
-                | layer("depth", "Z", t.depth)
-                | layer("forward", "uv", t.following * UP)
-                | layer("backward", "uv", t.previous * UP)
-            )
-        ),
-        direction="both",
-        attributes={"nuke/version": "15.0"},
-    ),
-    "luxcore": Renderer(
-        "LuxCore",
-        lambda t: {
-            "RGB_IMAGEPIPELINE_####.exr": layer("", "RGB", t.color),
-            "ALBEDO_####.exr": layer("", "RGB", t.albedo),
-            "AVG_SHADING_NORMAL_####.exr": layer("", "RGB", t.normal),
-            "DEPTH_####.exr": {"Y": t.depth},
-        },
-        spec="",
-    ),
-    "unreal": Renderer(
-        "Unreal",
-        lambda t: {
-            "shot.FinalImage.####.exr": layer("", "RGBA", t.color, t.alpha),
-            "shot.FinalImageMovieRenderQueue_WorldNormal.####.exr": layer("", "RGB", t.normal),
-            "shot.FinalImageMovieRenderQueue_WorldDepth.####.exr": layer("", "R", t.depth),
-            "shot.FinalImageMovieRenderQueue_MotionVectors.####.exr": layer("", "RG", t.following / t.size * UP),
-        },
-        roles="normal depth",
-        direction="next",
-        attributes={"unreal/jobName": "shot"},
-        spec="",
-    ),
-    "3delight": Renderer(
-        "common names",
-        one(
-            lambda t: (
-                layer("RGBA", "RGBA", t.color, t.alpha)
-                | layer("albedo", "RGB", t.albedo)
-                | layer("N", "XYZ", t.normal)
-                | layer("", "Z", t.depth)
-            )
-        ),
-    ),
-}
+    "renderman, apart": Renderer("RenderMan", lambda t: {"shot.####.exr": layer("Ci", "rgb", t.color)
+        | layer("", "a", t.alpha), "shot_variance.####.exr": layer("albedo", "rgb", t.albedo)
+        | layer("normal", "rgb", t.normal) | layer("zfiltered", "z", t.depth) | layer("mse", "rgb", t.variance)
+        | layer("sampleCount", "y", np.full_like(t.alpha, SAMPLES)) | layer("forward", "rg", t.following * UP)
+        | layer("backward", "rg", t.previous * UP)}, roles="albedo normal depth variance", direction="both"),
+    "vray": Renderer("V-Ray", one(lambda t: layer("", "RGBA", t.color, t.alpha)
+        | layer("diffuseFilter", "red,green,blue", t.albedo) | layer("normals", "X,Y,Z", t.normal) | {"zDepth": t.depth}
+        | layer("velocity", "RGB", t.following, t.depth * 0)), direction="next", attributes={"vrayInfo/camera": "cam"}),
+    "vray, prefixed": Renderer("V-Ray", one(lambda t: layer("", "RGBA", t.color, t.alpha)
+        | layer("VRayDiffuseFilter", "RGB", t.albedo) | layer("VRayNormals", "RGB", t.normal)
+        | layer("VRayZDepth", "R", t.depth) | layer("VRayVelocity", "RGB", t.following * UP, t.depth * 0)),
+        direction="next"),
+    "karma": Renderer("Karma", one(lambda t: layer("C", "RGBA", t.color, t.alpha) | layer("albedo", "RGB", t.albedo)
+        | layer("N", "XYZ", t.normal) | {"hitPz": t.depth}
+        | layer("motionvectors", "XYZ", t.following / t.size * UP, t.depth * 0)), direction="next",
+        attributes={"husk:render_stats": "{}"}),
+    "redshift": Renderer("Redshift", one(lambda t: layer("", "RGBA", t.color, t.alpha)
+        | layer("DiffuseFilter", "RGB", t.albedo) | layer("Normals", "RGB", t.normal) | layer("Z", "Z", t.depth)
+        | layer("MotionVectors", "RG", t.following * UP)), direction="next"),
+    "octane": Renderer("Octane", one(lambda t: layer("Beauty", "RGBA", t.color, t.alpha)
+        | layer("Diffuse filter info", "RGB", t.albedo) | layer("Shading normal", "RGB", t.normal)
+        | layer("Z-depth", "Z", t.depth) | layer("Motion vector", "RGB", t.following / t.size[0] * UP, t.depth * 0)),
+        direction="next"),
+    "mitsuba": Renderer("Mitsuba", one(lambda t: layer("my_image", "RGBA", t.color, t.alpha)
+        | layer("alb", "RGB", t.albedo) | layer("nn", "XYZ", t.normal) | layer("dd", "T", t.depth))),
+    "pbrt": Renderer("pbrt", one(lambda t: layer("", "RGB", t.color) | layer("Albedo", "RGB", t.albedo)
+        | layer("N", "XYZ", t.normal) | layer("Ns", "XYZ", t.normal) | layer("Variance", "RGB", t.variance * SAMPLES)
+        | layer("RelativeVariance", "RGB", t.variance)), roles="albedo normal variance",
+        attributes={"samplesPerPixel": SAMPLES}),
+    "moonray": Renderer("MoonRay", one(lambda t: layer("", "RGBA", t.color, t.alpha) | layer("albedo", "RGB", t.albedo)
+        | layer("normal", "XYZ", t.normal) | {"depth": t.depth}
+        | layer("motionvec", "XY", t.following / t.size * 2 * UP * t.alpha[..., None])), direction="next"),
+    "appleseed": Renderer("appleseed", one(lambda t: layer("beauty", "RGBA", t.color, t.alpha)
+        | layer("albedo", "RGB", t.albedo) | layer("shading_normal", "RGB", t.normal) | layer("depth", "Z", t.depth)
+        | layer("screen_space_velocity", "RGB", magnitude(t.following / t.size))), direction="next"),
+    "nuke": Renderer("Nuke", one(lambda t: layer("", "RGBA", t.color, t.alpha) | layer("albedo", "RGB", t.albedo)
+        | layer("normal", "XYZ", t.normal) | layer("depth", "Z", t.depth) | layer("forward", "uv", t.following * UP)
+        | layer("backward", "uv", t.previous * UP)), direction="both", attributes={"nuke/version": "15.0"}),
+    "luxcore": Renderer("LuxCore", lambda t: {"RGB_IMAGEPIPELINE_####.exr": layer("", "RGB", t.color),
+        "ALBEDO_####.exr": layer("", "RGB", t.albedo), "AVG_SHADING_NORMAL_####.exr": layer("", "RGB", t.normal),
+        "DEPTH_####.exr": {"Y": t.depth}}, spec=""),
+    "unreal": Renderer("Unreal", lambda t: {"shot.FinalImage.####.exr": layer("", "RGBA", t.color, t.alpha),
+        "shot.FinalImageMovieRenderQueue_WorldNormal.####.exr": layer("", "RGB", t.normal),
+        "shot.FinalImageMovieRenderQueue_WorldDepth.####.exr": layer("", "R", t.depth),
+        "shot.FinalImageMovieRenderQueue_MotionVectors.####.exr": layer("", "RG", t.following / t.size * UP)},
+        roles="normal depth", direction="next", attributes={"unreal/jobName": "shot"}, spec=""),
+    "3delight": Renderer("common names", one(lambda t: layer("RGBA", "RGBA", t.color, t.alpha)
+        | layer("albedo", "RGB", t.albedo) | layer("N", "XYZ", t.normal) | layer("", "Z", t.depth))),
+}  # fmt: skip

@@ -1,7 +1,5 @@
 """Files with several pictures: stereo views and view layers are all denoised, each by itself."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +15,7 @@ from hybrid.files.shots import open_shot
 from tests.commands import words_in
 from tests.renderers import Channels, Truth, cycles_vector, layer, save, truths
 
-FRAMES = truths()
+FRAMES = truths(np.s_[12:76, 24:120])
 WEIGHTS = Path(__file__).parent.parent / "data" / "small.safetensors"
 
 

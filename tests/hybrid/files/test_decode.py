@@ -1,7 +1,5 @@
 """Layers of files as arrays of a frame."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

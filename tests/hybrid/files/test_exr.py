@@ -1,7 +1,5 @@
 """Reading, finding and writing layers of OpenEXR files."""
 
-from __future__ import annotations
-
 import os
 import socket
 from fractions import Fraction
@@ -299,10 +297,7 @@ def test_only_the_replaced_channels_change(tmp_path):
 
 
 @settings(max_examples=30, deadline=None)
-@given(
-    values=arrays(np.float32, (3, 5), elements=st.floats(width=32)),
-    kind=st.sampled_from([np.float16, np.float32]),
-)
+@given(values=arrays(np.float32, (3, 5), elements=st.floats(width=32)), kind=st.sampled_from([np.float16, np.float32]))
 def test_written_values_are_the_nearest_and_no_inf_is_made(tmp_path_factory, values, kind):
     folder = tmp_path_factory.mktemp("exr")
     source = read_exr(save(folder / "a.exr", {"R": np.zeros((3, 5), kind)}))

@@ -1,7 +1,5 @@
 """Arrays of a frame."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

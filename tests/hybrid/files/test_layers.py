@@ -1,7 +1,5 @@
 """Which channels are what, and what is refused because it could be several."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +8,7 @@ import pytest
 from flow import motion
 from flow.motion import MotionConvention
 from hybrid.files.exr import ExrError, ExrImage, read_exr
-from hybrid.files.layers import describe_layers, find_layers, summarize_layers
+from hybrid.files.layers import describe_layers, find_layers
 from hybrid.files.shots import open_matching_sequence, open_shot, output_path
 from tests.exr_files import write_layers
 from tests.hybrid.files.test_exr import CYCLES, cycles_names, planes, save, save_parts
@@ -473,11 +471,7 @@ def test_an_aov_is_written_where_it_was_read(tmp_path):
     shot.write(tmp_path / "out.exr", 1, {"color": layer(5), "normal": layer(6)})
     image = read_exr(tmp_path / "out.exr")
     values = {str(x): image.channel(x.channels[0])[0, 0] for x in image.layers}
-    assert values == {
-        "ViewLayer.Combined.RGB": 5,
-        "ViewLayer.Denoising Normal.XYZ": 2,
-        "ViewLayer.Normal.XYZ": 6,
-    }
+    assert values == {"ViewLayer.Combined.RGB": 5, "ViewLayer.Denoising Normal.XYZ": 2, "ViewLayer.Normal.XYZ": 6}
 
 
 def test_a_layer_that_is_there_is_not_taken_for_a_new_one(tmp_path):
@@ -535,10 +529,3 @@ def test_another_sequence_follows_the_choice_made_for_the_shot(tmp_path):
     shot = open_shot(tmp_path / "a.0001.exr", layers={"color": "Front.Combined"})
     assert (open_matching_sequence(tmp_path / "b.0001.exr", shot).read(1).color == 2).all()
     assert (open_matching_sequence(tmp_path / "c.0001.exr", shot).read(1).color == 7).all()
-
-
-def test_one_line_says_what_was_taken(tmp_path):
-    layers = find_layers(headers(tmp_path, cycles_names()), aovs=["Depth"])
-    assert summarize_layers(layers).endswith("alpha ViewLayer.Combined.A, aov Depth ViewLayer.Depth.Z")
-    names = cycles_names({**CYCLES, "Noisy Image": "RGBA"})
-    assert summarize_layers(find_layers(headers(tmp_path, names))).endswith("result to ViewLayer.Combined.RGB")

@@ -1,7 +1,5 @@
 """The layers of a shot, in one of its frames."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from hybrid.files.passes import BEAUTY, Passes, Sum

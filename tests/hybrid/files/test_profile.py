@@ -1,7 +1,5 @@
 """Profiles: what each renderer's files are known by, and what is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Reading the frames of a shot."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

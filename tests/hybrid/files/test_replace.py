@@ -1,7 +1,5 @@
 """Files are written whole or not at all, and never over somebody else's file."""
 
-from __future__ import annotations
-
 import errno
 import os
 import socket

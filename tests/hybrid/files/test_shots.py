@@ -1,7 +1,5 @@
 """Shots, the frames around a frame, and the names of files."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -10,7 +8,7 @@ import OpenEXR
 import pytest
 
 from flow.motion import CYCLES
-from hybrid.files.exr import ExrError, read_exr
+from hybrid.files.exr import read_exr
 from hybrid.files.reader import Interpretation
 from hybrid.files.shots import Shot, open_shot, output_path
 from hybrid.plan import Rules
@@ -45,16 +43,6 @@ def test_a_lossy_compression_of_what_is_kept_is_named(tmp_path):
 # --- names
 
 
-@pytest.mark.parametrize("pattern", ["shot.####.exr", "shot.%04d.exr", "shot.@@@@.exr", "shot.#.exr", ""])
-def test_every_way_of_naming_a_shot_finds_the_same_frames(tmp_path, pattern):
-    shot = open_shot(save_frames(tmp_path, range(8, 12)) / pattern)
-    assert shot.numbers == (8, 9, 10, 11)
-    assert len(shot) == 4
-    assert shot.warnings == ()
-    assert shot.path(9) == tmp_path / "shot.0009.exr"
-    assert shot.read(9).color[0, 0, 0] == 9
-
-
 def test_one_file_is_a_shot_of_one_frame(tmp_path):
     shot = open_shot(save_frames(tmp_path, [8, 9]) / "shot.0009.exr")
     assert shot.numbers == (9,)
@@ -65,19 +53,6 @@ def test_one_file_is_a_shot_of_one_frame(tmp_path):
     save_frames(tmp_path, [1], "still.exr")
     assert open_shot(tmp_path / "still.exr").warnings == ()
     assert open_shot(tmp_path / "still.exr").numbers == (1,)
-
-
-def test_numbers_may_outgrow_their_padding_and_be_negative(tmp_path):
-    save_frames(tmp_path, [98, 99, 100, 101], "s.{:02d}.exr")
-    assert open_shot(tmp_path / "s.##.exr").numbers == (98, 99, 100, 101)
-    save_frames(tmp_path, [-1, 0, 1], "n.{:04d}.exr")
-    assert open_shot(tmp_path / "n.####.exr").numbers == (-1, 0, 1)
-
-
-def test_width_of_the_pattern_decides_between_sequences_of_one_name(tmp_path):
-    save_frames(save_frames(tmp_path, [10, 11], "a.{:02d}.exr"), [10, 12], "a.{:04d}.exr")
-    assert open_shot(tmp_path / "a.##.exr").numbers == (10, 11)
-    assert open_shot(tmp_path / "a.####.exr").numbers == (10, 12)
 
 
 def test_no_match_names_the_pattern_and_what_is_there(tmp_path):
@@ -91,12 +66,6 @@ def test_no_match_names_the_pattern_and_what_is_there(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(FileNotFoundError, match="no EXR files in this folder"):
         open_shot(tmp_path / "empty")
-
-
-def test_folder_of_several_sequences_lists_them(tmp_path):
-    save_frames(save_frames(tmp_path, [8, 9]), [1, 2], "other.{:04d}.exr")
-    with pytest.raises(ValueError, match=r"several sequences.*other\.####\.exr.*shot\.####\.exr"):
-        open_shot(tmp_path)
 
 
 # --- ranges, holes, neighbours
@@ -175,13 +144,6 @@ def test_frame_has_all_roles_with_their_shapes(tmp_path):
     assert frame.source == tmp_path / "a.0001.exr"
 
 
-def test_overrides_and_missing_aovs(tmp_path):
-    write_layers(tmp_path / "a.exr", {"key": flat_image(1), "fill": flat_image(2)})
-    assert (open_shot(tmp_path / "a.exr", layers={"color": "fill"}).read(1).color == 2).all()
-    with pytest.raises(ExrError, match=r"no layer 'rim'; it has fill\.RGB, key\.RGB"):
-        open_shot(tmp_path / "a.exr", layers={"color": "key"}, aovs=["rim"]).read(1)
-
-
 @pytest.mark.parametrize("stale", [3, 4, 100])
 def test_a_frame_of_another_size_outside_the_range_changes_nothing(tmp_path, stale):
     """It stopped the run as a neighbour, and shortened the step."""
@@ -192,13 +154,6 @@ def test_a_frame_of_another_size_outside_the_range_changes_nothing(tmp_path, sta
     assert list(shot.available) == numbers
     assert [shot.read(number).color[0, 0, 0] for number in shot.neighbours(5, 2)] == numbers
     assert f"frames {stale} differ in size from those asked for: left out" in shot.warnings
-
-
-def test_frames_asked_for_must_be_of_one_size_still(tmp_path):
-    save_frames(tmp_path, [2], size=(8, 8))
-    shot = open_shot(save_frames(tmp_path, [1, 3]), frames="1-3")
-    with pytest.raises(ValueError, match="frames differ in size: frame 1 is 6x4, frame 2 is 8x8"):
-        shot.read(2)
 
 
 # --- writing

@@ -1,7 +1,5 @@
 """The sources of a picture, and why it is made again."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

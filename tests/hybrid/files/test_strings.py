@@ -1,7 +1,5 @@
 """Strings in headers: Latin-1, Shift-JIS, anything."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
