@@ -1,7 +1,5 @@
 """Pairs of pictures whose motion is known."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import cv2

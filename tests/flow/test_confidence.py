@@ -1,7 +1,5 @@
 """Confidence: what is out of frame, hidden or different is not trusted."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np
@@ -39,12 +37,6 @@ def test_a_still_frame_is_trusted_everywhere() -> None:
     # The cosine of a vector with itself, in float32.
     np.testing.assert_allclose(confidence, 1, atol=1e-5)
     assert confidence.dtype == np.float32
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (5, 5)])
-def test_tiny_frames(shape: tuple[int, int]) -> None:
-    still, inside = np.zeros((*shape, 2)), np.ones(shape, bool)
-    assert (estimate_confidence(still, inside=inside, reverse=still) == 1).all()
 
 
 def test_out_of_frame_and_bad_pixels_are_zero_with_their_neighbours() -> None:

@@ -1,7 +1,5 @@
 """Which convention vectors follow: what right and wrong readings leave, and what pictures cannot tell."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Guides of the flow: comparable, finite, and of a known noise."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -58,13 +56,6 @@ def test_fireflies_and_what_is_not_finite_stay_local() -> None:
     # The guided filter reaches twice its radius of 2.
     np.testing.assert_allclose(changed[far], make_guide(color, albedo, exposure=0.5).planes[far], atol=1e-5)
     assert not make_guide(np.zeros((8, 8, 3)), exposure=1.0).planes.any()
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (5, 5), (17, 33)])
-def test_tiny_and_odd_sizes(shape: tuple[int, int]) -> None:
-    color, albedo = np.random.default_rng(4).random((2, *shape, 3), np.float32)
-    guide = make_guide(color, albedo, exposure=0.5)
-    assert guide.planes.shape == guide.noise.shape == (*shape, 2)
 
 
 def test_noise_of_a_known_deviation() -> None:

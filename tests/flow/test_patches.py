@@ -1,7 +1,5 @@
 """Costs of vectors on patches: nothing for right ones, and only where there is something to see."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Which of several flows explains the pictures, pixel by pixel."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -75,15 +73,6 @@ def test_a_noisy_guide_counts_for_little() -> None:
         noise[..., noisy] = 0.5
         choice = select_flow([still, step], GuidePair(centre, neighbour, noise))[1]
         assert (choice[INNER] == chosen).mean() > 0.95
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (5, 5), (35, 31)])
-def test_tiny_and_odd_sizes(shape: tuple[int, int]) -> None:
-    rng = np.random.default_rng(4)
-    flows = rng.normal(size=(2, *shape, 2)).astype(np.float32)
-    selected, choice = select_flow(list(flows), plain(*rng.random((2, *shape), np.float32)))
-    assert selected.shape == (*shape, 2)
-    assert choice.shape == shape
 
 
 def test_given_arrays_are_not_written_to(shot: Shot) -> None:

@@ -1,7 +1,5 @@
 """Refining flows: exact vectors stay, wrong ones are mended, nothing breaks."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -150,16 +148,6 @@ def test_the_flow_does_not_depend_on_the_number_of_threads(
         monkeypatch.setattr(parallel, "thread_count", lambda count=count: count)
         flows.append(refine_flow(shot.guides, start, iterations=23))
     np.testing.assert_array_equal(*flows)
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (5, 5), (17, 33), (16, 16), (35, 31)])
-def test_tiny_and_odd_sizes(shape: tuple[int, int]) -> None:
-    rng = np.random.default_rng(4)
-    guides = plain(*rng.random((2, *shape), np.float32))
-    flow = refine_flow(guides, rng.normal(size=(*shape, 2)))
-    assert flow.shape == (*shape, 2)
-    assert np.isfinite(flow).all()
-    assert np.isfinite(dense_flow(guides)).all()
 
 
 def test_broken_vectors_spread_no_nan(shot: Shot) -> None:

@@ -1,7 +1,5 @@
 """Warping: identity, whole pixels, exact weights, borders, fireflies."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

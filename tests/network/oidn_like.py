@@ -1,7 +1,5 @@
 """Weights as OIDN has them, made up; pictures to denoise, and how near two of them are."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Small networks of every kind, for tests that train, write or read them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Weights in bfloat16: how far pictures are from those in float32, and what rounding keeps."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 
 import pytest

@@ -1,7 +1,5 @@
 """Weights of OIDN: from its library, where they are found by their digest."""
 
-from __future__ import annotations
-
 import hashlib
 from importlib.util import find_spec
 from pathlib import Path

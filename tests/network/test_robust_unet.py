@@ -2,8 +2,6 @@
 
 # ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
 
-from __future__ import annotations
-
 import pytest
 
 torch = pytest.importorskip("torch")
@@ -11,14 +9,7 @@ torch = pytest.importorskip("torch")
 from network import strips as strips_module
 from network.oidn_weights import find_library, load_oidn
 from network.robust_average import UNetWindow, pool
-from network.robust_unet import (
-    AVERAGE_BLEND,
-    MIRRORED,
-    RobustUNet,
-    RobustUNetConfig,
-    for_inference,
-    start_from_oidn,
-)
+from network.robust_unet import AVERAGE_BLEND, MIRRORED, RobustUNet, RobustUNetConfig, for_inference, start_from_oidn
 from network.unet import denoise_color
 from tests.network.test_robust_average import make_window, uniform
 

@@ -1,7 +1,5 @@
 """Pictures made strip by strip are those made at once."""
 
-from __future__ import annotations
-
 import pytest
 
 torch = pytest.importorskip("torch")

@@ -1,7 +1,5 @@
 """Curves, and their inverses."""
 
-from __future__ import annotations
-
 import pytest
 
 torch = pytest.importorskip("torch")

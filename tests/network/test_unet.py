@@ -1,7 +1,5 @@
 """OIDN's U-Net: OIDN's own pictures where pyoidn is installed."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 
 import pytest
@@ -18,10 +16,7 @@ from network.unet import OidnUNet, OidnUNetConfig, denoise_albedo, denoise_norma
 from tests.network.oidn_like import as_image, as_tensor, compressed, decibels, denoise, made_up_unet, scene
 
 pytestmark = pytest.mark.neural
-needs_oidn = [
-    pytest.mark.oidn,
-    pytest.mark.skipif(find_spec("pyoidn") is None, reason="pyoidn is not installed"),
-]
+needs_oidn = [pytest.mark.oidn, pytest.mark.skipif(find_spec("pyoidn") is None, reason="pyoidn is not installed")]
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """Means over cells, and the values between them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Bright pixels that move together are content; those that do not are noise."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from skimage.restoration import denoise_nl_means
@@ -59,10 +57,10 @@ def naive(window, variance, features, confidence, radius, patch, k):
 
 
 def test_matches_the_formula(rng):
-    window = rng.gamma(4, 0.25, (3, 9, 11, 3)).astype(np.float32)
-    variance = rng.uniform(0.1, 0.4, (9, 11, 3)).astype(np.float32)
-    features = rng.uniform(0, 0.2, (9, 11, 2)).astype(np.float32)
-    confidence = rng.uniform(0.1, 1, (3, 9, 11)).astype(np.float32)
+    window = rng.gamma(4, 0.25, (3, 6, 8, 3)).astype(np.float32)
+    variance = rng.uniform(0.1, 0.4, (6, 8, 3)).astype(np.float32)
+    features = rng.uniform(0, 0.2, (6, 8, 2)).astype(np.float32)
+    confidence = rng.uniform(0.1, 1, (3, 6, 8)).astype(np.float32)
     for radius, patch, k in ((2, 1, 0.5), (1, 2, 0.8)):
         result = joint_nlm(window, variance, features, confidence, radius=radius, patch_radius=patch, k=k)
         expected = naive(window, variance, features, confidence, radius, patch, k)

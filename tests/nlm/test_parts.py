@@ -1,7 +1,5 @@
 """Parts of the light, which add up before and after."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Pictures of other frames, in the light of the centre."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

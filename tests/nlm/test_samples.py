@@ -1,7 +1,5 @@
 """Samples correct a picture as far as they are certain: nothing else moves it."""
 
-from __future__ import annotations
-
 import tracemalloc
 
 import cv2

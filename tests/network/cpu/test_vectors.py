@@ -1,7 +1,5 @@
 """Instructions on vectors do in a compiled loop what their names say."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -2,8 +2,6 @@
 
 # ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
 
-from __future__ import annotations
-
 import pytest
 
 torch = pytest.importorskip("torch")
@@ -11,7 +9,6 @@ torch = pytest.importorskip("torch")
 from torch.nn import functional
 
 from network.paper.blocks import ResidualBlock, RobustAverage, TemporalModule
-from network.paper.ravg import ravg
 from network.robust_average import outermost_first
 
 pytestmark = pytest.mark.neural
@@ -73,37 +70,6 @@ def test_robust_average_block_can_be_the_identity() -> None:
     torch.nn.init.constant_(block.weight.bias, -200)  # sigmoid(-200) is below the smallest float32
     x = random(5, 4, 6, 5, dtype=torch.float32)
     assert torch.equal(block(x, 5), x)
-
-
-def test_robust_average_block_can_replace_a_frame_by_the_others() -> None:
-    block = RobustAverage(4)
-    torch.nn.init.constant_(block.weight.bias, 200)
-    x = random(5, 4, 6, 5, dtype=torch.float32)
-    expected = ravg([x[i : i + 1] for i in range(1, 5)])
-    torch.testing.assert_close(block(x, 5)[:1], expected)  # the first visited: the others are still as they were
-
-
-def test_robust_average_block_keeps_a_still_sequence() -> None:
-    torch.manual_seed(0)
-    block = RobustAverage(4)
-    x = random(1, 4, 6, 5, dtype=torch.float32).expand(5, -1, -1, -1)
-    torch.testing.assert_close(block(x, 5), x)  # blending equal values leaves float32 rounding
-
-
-def test_robust_average_block_sees_the_other_frames_as_a_set() -> None:
-    """The first frame visited is blended with an average of unchanged frames, in which order plays no part."""
-    torch.manual_seed(0)
-    block = RobustAverage(4).double()
-    x = random(5, 4, 6, 5)
-    torch.testing.assert_close(block(x[[0, 3, 1, 4, 2]], 5)[0], block(x, 5)[0])
-
-
-def test_robust_average_block_keeps_samples_of_a_batch_apart() -> None:
-    torch.manual_seed(0)
-    block = RobustAverage(4).double()
-    x = random(5, 2, 4, 6, 5)
-    both = block(x.flatten(0, 1), 5).unflatten(0, (5, 2))
-    torch.testing.assert_close(both[:, 1], block(x[:, 1], 5))
 
 
 def test_robust_average_block_of_one_frame_is_the_identity() -> None:

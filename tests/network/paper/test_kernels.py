@@ -2,8 +2,6 @@
 
 # ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
 
-from __future__ import annotations
-
 import itertools
 import math
 
@@ -107,11 +105,6 @@ def test_nothing_above_the_threshold_gives_the_identity_and_no_gradient() -> Non
     assert bool(gradient[..., 1].any())
 
 
-def test_predicted_kernels_do_not_depend_on_the_scale_of_the_weights() -> None:
-    weights = uniform(1, 25, 3, 3)
-    torch.testing.assert_close(predict_kernel(weights * 1000, centre=12), predict_kernel(weights, centre=12))
-
-
 def test_a_higher_threshold_removes_taps_and_never_adds_one() -> None:
     weights = uniform(1, 25, 8, 8)
     used = [predict_kernel(weights, t, centre=12) > 0 for t in (0, 0.01, 0.02, 0.03, 0.039)]
@@ -191,30 +184,6 @@ def test_constants_are_preserved_also_at_the_border() -> None:
     torch.testing.assert_close(filtered, frames[:, 1])  # float32 rounding
 
 
-def test_inside_the_image_the_shares_of_the_frames_sum_to_one() -> None:
-    kernels = predict_kernel(uniform(1, 75, 8, 8).float(), centre=37)
-    _, denominators = apply_kernels(kernels, torch.zeros(1, 3, 1, 8, 8))
-    torch.testing.assert_close(denominators.sum(1)[..., 2:-2, 2:-2], torch.ones(1, 1, 4, 4))
-
-
-def test_a_firefly_outside_the_support_of_the_kernel_leaves_no_trace() -> None:
-    kernels = torch.zeros(1, 25, 9, 9)
-    kernels[:, 12] = 1
-    frames = torch.ones(1, 1, 3, 9, 9)
-    frames[..., 4, 5] = 1e30
-    filtered = mean_of(*apply_kernels(kernels, frames), frames[:, 0])
-    assert torch.equal(filtered[..., :5], torch.ones(1, 3, 9, 5))
-
-
-def test_kernels_are_linear_so_that_layers_still_sum() -> None:
-    kernels, a, b = uniform(1, 27, 5, 4), uniform(1, 3, 3, 5, 4, seed=1), uniform(1, 3, 3, 5, 4, seed=2)
-
-    def filtered(x: torch.Tensor) -> torch.Tensor:
-        return mean_of(*apply_kernels(kernels, x), x[:, 1])
-
-    torch.testing.assert_close(filtered(a + b), filtered(a) + filtered(b))
-
-
 def test_without_any_weight_the_image_is_the_fallback() -> None:
     fallback = uniform(1, 3, 4, 4)
     image = mean_of(torch.zeros(1, 2, 3, 4, 4), torch.zeros(1, 2, 1, 4, 4), fallback)
@@ -269,18 +238,6 @@ def test_parts_of_several_resolutions_sum_to_the_image_and_to_one() -> None:
         parts, shares = filtered.parts()
         torch.testing.assert_close(parts.sum(1), filtered.image(color[:, 1]), rtol=1e-5, atol=1e-5)  # ε = 1e-6
         torch.testing.assert_close(shares.sum(1), torch.ones(2, 1, 8, 8, dtype=torch.float64))
-
-
-def test_without_blend_only_the_finest_resolution_counts() -> None:
-    kernels, color = pyramid(), uniform(1, 3, 2, 8, 8, seed=5)
-    fine = Pyramid(kernels.kernels, tuple(torch.zeros_like(blend) for blend in kernels.blends))
-    expected = Filtered.of(kernels.kernels[0], color).image(color[:, 1])
-    torch.testing.assert_close(Filtered.of(fine, color).image(color[:, 1]), expected)
-
-
-def test_a_constant_passes_all_resolutions() -> None:
-    color = torch.full((1, 3, 2, 8, 8), 3.7, dtype=torch.float64)
-    torch.testing.assert_close(Filtered.of(pyramid(), color).image(color[:, 1]), color[:, 1])
 
 
 def test_gradient_through_all_resolutions() -> None:

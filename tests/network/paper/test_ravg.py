@@ -2,8 +2,6 @@
 
 # ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
 
-from __future__ import annotations
-
 import pytest
 
 torch = pytest.importorskip("torch")
@@ -38,22 +36,6 @@ def test_ravg_of_one_and_two_frames() -> None:
 def test_ravg_of_no_frame_is_an_error() -> None:
     with pytest.raises(ValueError, match="frames: expected at least one"):
         ravg([])
-
-
-@pytest.mark.parametrize("count", [3, 4, 5, 6])
-def test_ravg_does_not_depend_on_the_order(count: int) -> None:
-    frames = random(count, 50)
-    order = torch.randperm(count, generator=torch.Generator().manual_seed(1))
-    torch.testing.assert_close(ravg(frames[order].unbind(0)), ravg(frames.unbind(0)), rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("count", [3, 4, 5])
-@pytest.mark.parametrize("outlier", [1e6, -1e6])
-def test_ravg_in_bfloat16_is_not_harmed_by_an_outlier(count: int, outlier: float) -> None:
-    frames = torch.full((count, 8), 0.75, dtype=torch.bfloat16)
-    frames[1] = outlier
-    # 0.75 has an exact bfloat16; Σ − max − min would have lost it beside 1e6, whose bfloat16 spacing is 4096.
-    assert torch.equal(ravg(frames.unbind(0)), torch.full((8,), 0.75, dtype=torch.bfloat16))
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 6])

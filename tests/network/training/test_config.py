@@ -1,9 +1,5 @@
 """Settings of a training: wrong ones are named, and no torch is needed to check them."""
 
-from __future__ import annotations
-
-import subprocess
-import sys
 from dataclasses import fields, replace
 
 import pytest
@@ -61,9 +57,3 @@ def test_a_limit_of_steps_or_of_time_is_all_that_is_needed() -> None:
     without = {field.name for field in fields(TrainConfig)} - {"steps", "minutes"}
     by_time = TrainConfig(minutes=1.0)
     assert all(getattr(by_time, name) == getattr(CONFIG, name) for name in without)
-
-
-def test_it_is_known_without_torch() -> None:
-    code = "import sys, network.training.config; print('torch' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"
