@@ -7,7 +7,6 @@ import json
 import logging
 import math
 import re
-import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, fields, replace
@@ -113,11 +112,6 @@ class DenoiseOptions:
     def __post_init__(self) -> None:
         self._check_types()
         preset = self.preset
-        if "pooled" in (preset, self.method) or preset == "gathered":
-            raise ValueError("pooled is no method any more, expected preset quality, which does the same and more")
-        if preset == "tkpcn":
-            weights = "network/paper/weights/tkpcn.safetensors"
-            raise ValueError(f"preset is 'tkpcn', no preset any more, expected --weights {weights}")
         if preset and preset not in METHOD_OF_PRESET:
             raise ValueError(f"preset is {preset!r}, expected one of {', '.join(METHOD_OF_PRESET)}")
         method = self.method or METHOD_OF_PRESET.get(preset, "network")
@@ -235,13 +229,9 @@ def replace_options(options: DenoiseOptions | None, changes: Mapping[str, object
     """Return options, or the defaults, with some fields replaced; ValueError for a field that does not exist."""
     if not (options is None or isinstance(options, DenoiseOptions)):
         raise ValueError(f"options is {options!r}, expected DenoiseOptions, or keywords such as preset='fast'")
-    given = dict(changes)
-    if "estimate" in given:  # the old name
-        warnings.warn("estimate is now first_pass, and goes in the next release", DeprecationWarning, stacklevel=3)
-        given["first_pass"] = given.pop("estimate") or ""
-    if unknown := given.keys() - DEFAULTS.keys():
+    if unknown := changes.keys() - DEFAULTS.keys():
         raise ValueError(f"option {min(unknown)!r} is not there, expected one of {', '.join(DEFAULTS)}")
-    return DenoiseOptions(**given) if options is None else replace(options, **given)  # type: ignore[arg-type]
+    return DenoiseOptions(**changes) if options is None else replace(options, **changes)  # type: ignore[arg-type]
 
 
 def check_first_pass(spec: str) -> None:

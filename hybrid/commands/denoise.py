@@ -367,7 +367,8 @@ class _Report:
 
     def finish(self) -> None:
         """Log which stages ran, and a table of seconds and memory."""
-        plan = merge(self.plans).decisions if self.plans else ()
+        merged = merge(self.plans) if self.plans else None
+        plan = () if merged is None else merged.decisions
         with_fireflies, without = np.mean(self.means, axis=0).tolist() if self.means else (None, None)
         mean = {"with_fireflies": with_fireflies, "without": without}
         timings = self.job.timings
@@ -375,8 +376,8 @@ class _Report:
         for decision in plan:
             if self.job.options.method == "network" or decision.stage not in NEURAL_STAGES:
                 LOG.debug(f"  {'run' if decision.on else 'not run'}: {decision.stage} ({decision.reason})")
-            if decision.stage == "fixed-noise" and decision.on and not decision.forced:
-                LOG.warning(f"constant seed: {decision.reason}")
+        if merged is not None:
+            shots.log_seed(merged)
         stages = {name: asdict(stage) for name, stage in timings.stages.items()}
         LOG.debug(timings.table(self.pixels), extra={"facts": {"stages": stages}})
 

@@ -1,6 +1,7 @@
 """`ravg inspect`: which layer has which role, and which stages run."""
 
 import json
+import logging
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
@@ -10,7 +11,16 @@ from rich.console import Console
 
 from hybrid.commands import options as opt
 from hybrid.commands.log import LOG, Progress, print_table, printable
-from hybrid.commands.shots import ShotInput, expect_views_apart, in_view, log_cuts, log_findings, split_stages, views_of
+from hybrid.commands.shots import (
+    ShotInput,
+    expect_views_apart,
+    in_view,
+    log_cuts,
+    log_findings,
+    log_seed,
+    split_stages,
+    views_of,
+)
 from hybrid.files.layers import describe_layers
 from hybrid.job import validate_views
 from hybrid.plan import STAGES, Decision, Rules
@@ -39,7 +49,7 @@ def inspect(
 
 
 def _inspect(read: ShotInput, rules: Rules, *, as_json: bool) -> None:
-    """Print layers, findings and plan of a shot."""
+    """Print a verdict on a shot; if the log is verbose, layers, findings and plan too."""
     shot = read.open()
     views, report = validate_views(shot, strict=read.strict)
     log_findings(report, views)
@@ -74,10 +84,16 @@ def _inspect(read: ShotInput, rules: Rules, *, as_json: bool) -> None:
         typer.echo(json.dumps(document, indent=1))
         return
     console = Console()
-    console.print(_verdict(["files"] * len(shot.warnings) + [found.role for found in findings if found.warning]))
+    roles = [*(found.role for found in findings if found.warning), *("seed" for plan in plans if log_seed(plan))]
+    console.print(_verdict(["files"] * len(shot.warnings) + roles))
     console.print(f"{len(shot)} frames, {shot.numbers[0]}-{shot.numbers[-1]}, {width}×{height}", highlight=False)
-    profile_line = f"profile: {printable(layers[0].profile)} ({printable(layers[0].reason)})\n"
-    console.print(profile_line, highlight=False, markup=False)
+    console.print(
+        f"profile: {printable(layers[0].profile)} ({printable(layers[0].reason)})", highlight=False, markup=False
+    )
+    if not LOG.isEnabledFor(logging.DEBUG):
+        console.print("-v shows layers, motion vectors and stages", highlight=False)
+        return
+    console.print()
     names = [f" of {printable(str(found.color))}" if len(views) > 1 else "" for found in layers]
     for found, name in zip(layers, names, strict=True):
         print_table(("role", "layer", "note"), describe_layers(found), f"Layers{name}")
@@ -97,9 +113,9 @@ def _inspect(read: ShotInput, rules: Rules, *, as_json: bool) -> None:
 def _verdict(roles: Sequence[str]) -> str:
     """One line about the warnings, of which these are the roles."""
     if not roles:
-        return "This shot is fine.\n"
+        return "This shot is fine."
     found = "a warning says" if len(roles) == 1 else f"{len(roles)} warnings say"
-    return f"This shot could be better ({', '.join(dict.fromkeys(roles))}): {found} how.\n"
+    return f"This shot could be better ({', '.join(dict.fromkeys(roles))}): {found} how."
 
 
 def _measured(decision: Decision) -> str:

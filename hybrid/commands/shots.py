@@ -168,6 +168,15 @@ def log_cuts(plan: Plan, known: Sequence[Finding], *, strict: bool, name: str = 
     return [*cuts, *repeats]
 
 
+def log_seed(plan: Plan) -> bool:
+    """Warn if the plan finds one seed for all frames; return whether it does."""
+    found = [decision for decision in plan.decisions if decision.stage == "fixed-noise" and not decision.forced]
+    for decision in found:
+        if decision.on:
+            LOG.warning(f"constant seed: {decision.reason}")
+    return any(decision.on for decision in found)
+
+
 def split_stages(names: Sequence[str] | None) -> tuple[str, ...]:
     """Split names of stages."""
     return tuple(name for item in names or () for name in item.split(","))

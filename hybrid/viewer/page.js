@@ -218,10 +218,9 @@ async function showFacts() {
 }
 
 function showRecord() {
-  const { stages = {}, plan = [], command, preset, first_pass, estimate, asked = [], peak_bytes: peak } =
-    source.sequences[0].record; // estimate: the name of the first pass until version 0.2
+  const { stages = {}, plan = [], command, preset, first_pass, asked = [], peak_bytes: peak } = source.sequences[0].record;
   $("#record").hidden = !command;
-  showPairs($("#record dl"), { command, preset, "first pass": first_pass ?? estimate, frames: asked.length, ...(peak && { memory: mebibytes(peak) }) });
+  showPairs($("#record dl"), { command, preset, "first pass": first_pass, frames: asked.length, ...(peak && { memory: mebibytes(peak) }) });
   $("#record tbody").replaceChildren(...Object.entries(stages).map(([name, cost]) => {
     const row = make("tr");
     row.append(make("td", name), make("td", cost.seconds.toFixed(2)), make("td", mebibytes(cost.peak_bytes)));

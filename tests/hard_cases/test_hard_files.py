@@ -87,7 +87,7 @@ def test_names_from_files_are_only_shown(tmp_path, capsys, name):
     write_layers(path, layers, attributes={"owner": name, "comments": name})
     before = sorted(tmp_path.rglob("*"))
     for words in (["--layer", f"albedo={name}"], ["--layer", "albedo=none such"]):
-        code = main(["inspect", str(path), *words])
+        code = main(["inspect", str(path), "-v", *words])
         out, err = capsys.readouterr()
         assert code == (0 if words[1].endswith(name) else 1)
         assert "Traceback" not in err

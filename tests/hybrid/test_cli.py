@@ -24,7 +24,7 @@ from hybrid.plan import STAGES
 from hybrid.records import read_records
 from tests.commands import words_in
 from tests.exr_files import write_layers
-from tests.scenes import Scene
+from tests.scenes import Scene, grained
 
 ALL = {name: LazyCommand(name, entry).load() for name, entry in COMMANDS.items()}
 
@@ -159,7 +159,7 @@ def test_the_documentation_names_every_default_of_a_site():
 
 
 def test_inspect_names_channels_and_decisions(shot_folder, capsys):
-    code, out, _ = run(capsys, "inspect", shot_folder)
+    code, out, _ = run(capsys, "inspect", shot_folder, "-v")
     assert code == 0
     for word in ("ViewLayer.Combined", "Vector", "demodulate", "refine", "off"):
         assert word in out
@@ -168,8 +168,22 @@ def test_inspect_names_channels_and_decisions(shot_folder, capsys):
 def test_inspect_begins_with_a_verdict(shot_folder, capsys):
     fine = run(capsys, "inspect", EXAMPLE, "--frames", "8-9")[1]
     better = run(capsys, "inspect", shot_folder)[1]  # its normals and depth do not vary
-    assert fine.startswith("This shot is fine.\n")
-    assert better.startswith("This shot could be better (normal, depth): 2 warnings say how.\n")
+    assert fine.splitlines()[0] == "This shot is fine."
+    assert better.splitlines()[0] == "This shot could be better (normal, depth): 2 warnings say how."
+    assert len(fine.splitlines()) == len(better.splitlines()) == 4, "tables are for -v"
+
+
+def test_one_seed_for_all_frames_is_said_by_inspect_too(tmp_path, capsys):
+    """It stood in a table alone, and the verdict was that the shot is fine."""
+    scene = Scene(height=96, width=128)
+
+    def edit(index, layers):
+        layers["ViewLayer.Combined"][:] = grained(scene.clean(index)["ViewLayer.Combined"], 5)
+
+    folder = scene.write(tmp_path / "in", edit=edit)
+    _, out, err = run(capsys, "inspect", folder)
+    assert "seed" in out.splitlines()[0]
+    assert "warning: constant seed: " in err
 
 
 def test_denoise_writes_denoised_frames_that_keep_everything_else(tmp_path, capsys):

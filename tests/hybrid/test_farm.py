@@ -1,6 +1,7 @@
 """Frames in chunks, on many machines, are the frames of the shot: the same bytes, whoever makes them, in any order."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from hybrid.cli import main
+from hybrid.job import METHOD_OF_PRESET
 from hybrid.records import read_records
 from tests.scenes import Scene
 
@@ -131,6 +133,8 @@ def test_the_template_asks_for_frames_that_the_command_knows():
     assert options == {"--output", "--frames", "--preset", "--first-pass", "--resume", "--keep-going", "--log-format"}
     shown = _help()
     assert all(option in shown for option in options)
+    (presets,) = re.findall(r"allowedValues: \[(.*)\]", text)
+    assert {*presets.split(", ")} <= METHOD_OF_PRESET.keys()
 
 
 def _help():

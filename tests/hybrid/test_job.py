@@ -251,19 +251,6 @@ def test_presets_and_methods_belong_together():
     assert [DenoiseOptions(preset=name).method for name in ("quality", "draft")] == ["network", "classical"]
     assert [DenoiseOptions(method=name).preset for name in PRESETS] == ["balanced", "standard"]
     assert [DenoiseOptions(method=name).first_pass for name in PRESETS] == ["auto", "none"]
-    for options in ({"preset": "pooled"}, {"preset": "gathered"}, {"method": "pooled"}):
-        with pytest.raises(ValueError, match="pooled is no method any more, expected preset quality"):
-            DenoiseOptions(**options)
-
-
-def test_the_old_name_of_the_first_pass_is_accepted():
-    with pytest.warns(DeprecationWarning, match="estimate is now first_pass"):
-        assert replace_options(None, {"estimate": "nlm"}).first_pass == "nlm"
-
-
-def test_tkpcn_is_no_preset_any_more_and_its_weights_are_named():
-    with pytest.raises(ValueError, match=r"preset is 'tkpcn', no preset any more, expected --weights .*tkpcn\.safet"):
-        job.DenoiseOptions(preset="tkpcn")
 
 
 @pytest.mark.parametrize("in_memory", [False, True])

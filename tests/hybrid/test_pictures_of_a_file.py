@@ -79,7 +79,7 @@ def test_inspect_has_the_layers_and_the_plan_of_both_eyes(tmp_path: Path, capsys
     ]
     gates = [next(d for d in eye["plan"] if d["stage"] == "gate") for eye in (left, right)]
     assert gates[0]["figure"] < gates[1]["figure"]
-    assert main(["inspect", str(tmp_path)]) == 0
+    assert main(["inspect", str(tmp_path), "-v"]) == 0
     said = capsys.readouterr().out
     for words in ("Layers of ViewLayer.Combined.left", "Plan of ViewLayer.Combined.right"):
         assert words in said

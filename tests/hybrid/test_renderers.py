@@ -75,7 +75,7 @@ def test_without_vectors_or_with_wrong_ones_the_picture_is_another(told) -> None
 
 @pytest.mark.parametrize("name", ["arnold", "appleseed"])
 def test_inspect_says_which_profile_and_why_and_what_was_tried(name: str, tmp_path: Path) -> None:
-    said = run("inspect", RENDERERS[name].write(tmp_path, FRAMES), None)
+    said = run("inspect", RENDERERS[name].write(tmp_path, FRAMES), None, "-v")
     why = {"arnold": "header attribute arnold/version", "appleseed": "layer screen_space_velocity"}[name]
     assert f"profile: {RENDERERS[name].profile} ({why})" in said
     assert "taken" in said

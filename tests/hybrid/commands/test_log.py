@@ -147,7 +147,7 @@ def test_a_closed_pipe_does_not_end_the_work(shot_folder, tmp_path, stream):
 
 @pytest.mark.posix
 def test_streams_that_were_never_open(shot_folder):
-    command, options = ravg("inspect", shot_folder)
+    command, options = ravg("inspect", shot_folder, "-v")
     script = 'exec "$0" "$@" >&- 2>&-'
     assert subprocess.run(["sh", "-c", script, *command], **options, check=False).returncode == 0
 
@@ -160,7 +160,7 @@ def test_streams_that_were_never_open(shot_folder):
     ],
 )
 def test_terminals_that_know_only_ascii(shot_folder, environment):
-    command, options = ravg("inspect", shot_folder, env={**os.environ, **environment, "PYTHONUTF8": "0"})
+    command, options = ravg("inspect", shot_folder, "-v", env={**os.environ, **environment, "PYTHONUTF8": "0"})
     done = subprocess.run(command, **options, capture_output=True, check=False)
     assert done.returncode == 0, done.stderr
     assert b"56x40" in done.stdout
@@ -169,7 +169,7 @@ def test_terminals_that_know_only_ascii(shot_folder, environment):
 
 def test_tables_stay_in_line_where_signs_are_replaced(shot_folder):
     """The encoding of pipes on Windows has no "≤"; two letters in its place shifted the columns behind it."""
-    command, options = ravg("inspect", shot_folder, env={**os.environ, "PYTHONIOENCODING": "cp1252"})
+    command, options = ravg("inspect", shot_folder, "-v", env={**os.environ, "PYTHONIOENCODING": "cp1252"})
     printed = subprocess.run(command, **options, capture_output=True, check=True).stdout.decode("cp1252")
     rows = [line for line in printed.partition("Plan")[2].splitlines() if line.startswith("|") and "-+-" not in line]
     assert any(" <= " in row for row in rows)
