@@ -72,7 +72,7 @@ class Sequence:
 
     @property
     def key(self) -> tuple[Path, str, str] | None:
-        """What tells the sequence from others: folder, and the name around the number; None without frames."""
+        """The folder and the name around the number, by which sequences differ; None without frames."""
         path = next(iter(self._files.values()), None)
         return None if path is None else (path.parent.resolve(), pattern_of(path).before, pattern_of(path).after)
 

@@ -72,7 +72,7 @@ def test_a_ladder_is_drawn_on_logarithmic_axes_from_its_errors() -> None:
 
 
 def test_every_point_is_named_inside_and_never_on_another_name() -> None:
-    """Of a crowd most were not."""
+    """Most of a crowd were not."""
     rng = np.random.default_rng(3)
     crowd = [result(f"method {i:02d}", float(rng.uniform(28, 32)), float(rng.uniform(0.5, 3))) for i in range(30)]
     figure = draw(crowd)
