@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -219,7 +220,13 @@ def _draw_labels(figure: Figure, axes: Axes, points: Sequence[_Point], metric: M
         if farther > FARTHER[0]:
             start = axes.transData.transform((p.x, p.y))
             end = axes.transData.inverted().transform(start + np.multiply(offset, figure.dpi / 72))
-            style = {"color": color, "linewidth": 0.5, "zorder": 1, "clip_on": False, "gid": f"bar-{p.index}"}
+            style: dict[str, Any] = {
+                "color": color,
+                "linewidth": 0.5,
+                "zorder": 1,
+                "clip_on": False,
+                "gid": f"bar-{p.index}",
+            }
             axes.plot(*zip((p.x, p.y), end, strict=True), scalex=False, scaley=False, **style)
 
 
