@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from flow.warp import empty_places, interpolate_row, locate, locate_row, weigh, weigh_whole
+from flow.warp import ends_inside, interpolate_row, locate_row, warp, weigh_whole
 from loops.decay import decay
 from loops.parallel import run_bands
 
@@ -34,6 +34,8 @@ _UNLIKELY = 40.0
 _LARGEST = np.float32(4)
 # Squared length of a normal on a surface: below a tenth of the samples on one, its direction is that of a stray sample.
 _SURFACE = np.float32(0.01)
+# Rows that are compared at a time, which stay in the caches.
+_STRIP = 32
 
 _Pair = tuple[np.ndarray, np.ndarray]
 
@@ -202,46 +204,20 @@ def find_coverage(flow: np.ndarray, valid: np.ndarray, measured: np.ndarray, fir
     The flow (h, W, 2), pixels, and its validity are those of rows of the centre from `first_row` on, `measured` (H, W)
     is of the whole neighbour.
     """
+    if not measured.all():
+        # A pixel of which less than all is finite color is not measured.
+        share, inside = warp(measured, flow, first_row=first_row)
+        return np.asarray(valid & inside & (share > np.float32(0.999)))
     covered = np.empty(valid.shape, np.bool_)
-    given = (np.ascontiguousarray(layer) for layer in (flow, valid, measured))
-    run_bands(_cover, len(covered), *given, bool(measured.all()), first_row, covered)
+    for top in range(0, len(flow), _STRIP):
+        rows = slice(top, top + _STRIP)
+        covered[rows] = valid[rows] & ends_inside(flow[rows], measured.shape, first_row + top)
     return covered
 
 
 def fill_uncovered(warped: np.ndarray, centre: np.ndarray, coverage: np.ndarray) -> None:
     """Write the centre's pixels (H, W, C) into a warped picture, in place, where its coverage (H, W) is 0."""
-    run_bands(_fill, len(warped), warped, np.ascontiguousarray(centre), coverage)
-
-
-@njit(nogil=True, cache=True)
-def _cover(
-    first: int, last: int, flow: np.ndarray, valid: np.ndarray, measured: np.ndarray, whole: bool, first_row: int,
-    out: np.ndarray,
-) -> None:  # fmt: skip
-    height, width = measured.shape
-    for y in range(first, last):
-        for x in range(width):
-            place = locate(np.float32(x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1], width, height)
-            if whole:
-                out[y, x] = valid[y, x] and place.inside
-                continue
-            x0, y0, x1, y1 = np.uintp(place.x0), np.uintp(place.y0), np.uintp(place.x1), np.uintp(place.y1)
-            weights, share = weigh(place), np.float32(0)
-            share += weights[0] if measured[y0, x0] else np.float32(0)
-            share += weights[1] if measured[y0, x1] else np.float32(0)
-            share += weights[2] if measured[y1, x0] else np.float32(0)
-            share += weights[3] if measured[y1, x1] else np.float32(0)
-            # A pixel of which less than all is finite color is not measured.
-            out[y, x] = valid[y, x] and place.inside and share > np.float32(0.999)
-
-
-@njit(nogil=True, cache=True)
-def _fill(first: int, last: int, warped: np.ndarray, centre: np.ndarray, coverage: np.ndarray) -> None:
-    for y in range(first, last):
-        for x in range(coverage.shape[1]):
-            if coverage[y, x] == 0:
-                for c in range(warped.shape[2]):
-                    warped[y, x, c] = centre[y, x, c]
+    cv2.copyTo(np.ascontiguousarray(centre), (coverage == 0).view(np.uint8), warped)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -252,10 +228,15 @@ def _spread(first: int, last: int, guide: np.ndarray, is_albedo: bool, out: np.n
     rows = np.empty((3, channels, width + 2), np.float32)
     spread, greatest, square = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     for y in range(first, last):
-        # By planes: several pixels are computed at once.
-        _mirror(guide, min(abs(y - 1), height - 1), rows[0])
-        _mirror(guide, y, rows[1])
-        _mirror(guide, min(y + 1, max(2 * height - 3 - y, 0)), rows[2])
+        for k, row in enumerate((min(abs(y - 1), height - 1), y, min(y + 1, max(2 * height - 3 - y, 0)))):
+            # By planes: several pixels are computed at once.
+            for c in range(channels):
+                plane = rows[k, c]
+                for x in range(width):
+                    value = guide[row, x, c]
+                    # Its square would overflow, or it is not finite.
+                    plane[x + 1] = value if abs(value) < np.float32(1e15) else np.float32(0)
+                plane[0], plane[width + 1] = plane[min(2, width)], plane[max(width - 1, 1)]
         spread[:], greatest[:], square[:] = 0, 1, 0
         for c in range(channels):
             a, b, d = rows[0, c], rows[1, c], rows[2, c]
@@ -278,22 +259,6 @@ def _spread(first: int, last: int, guide: np.ndarray, is_albedo: bool, out: np.n
             out[y, x] = spread[x] * ninth / scale
 
 
-@njit(nogil=True)
-def _mirror(guide: np.ndarray, row: int, planes: np.ndarray) -> None:
-    """Write a row (W, C), `_bounded`, into planes (C, W + 2), with a mirrored pixel at each end."""
-    width = guide.shape[1]
-    for c in range(len(planes)):
-        for x in range(width):
-            planes[c, x + 1] = _bounded(guide[row, x, c])
-        planes[c, 0], planes[c, width + 1] = planes[c, min(2, width)], planes[c, max(width - 1, 1)]
-
-
-@njit(nogil=True)
-def _bounded(value: np.float32) -> np.float32:
-    """The value, or 0 where it is not finite or its square would overflow."""
-    return value if abs(value) < np.float32(1e15) else np.float32(0)
-
-
 @njit(nogil=True, cache=True, error_model="numpy")
 def _compare(
     first: int, last: int, inside: np.ndarray, flow: np.ndarray, albedos: _Pair, normals: _Pair, first_row: int,
@@ -305,13 +270,12 @@ def _compare(
     zero, one, infinite, width = np.float32(0), np.float32(1), np.float32(np.inf), out.shape[1]
     # All layers of the neighbour have its size, or none.
     height = max(len(other_albedo), len(other_normal), 1)
-    places = empty_places(width)
     colors, directions = np.empty((albedo.shape[2], width), np.float32), np.empty((normal.shape[2], width), np.float32)
     difference, greatest = np.empty(width, np.float32), np.empty(width, np.float32)
     squares, product = np.empty((2, width), np.float32), np.empty(width, np.float32)
     square, other_square = squares[0], squares[1]
     for y in range(first, last):
-        locate_row(flow, y, (first_row, 0), width, height, places)
+        places = locate_row(flow, y, (first_row, 0), width, height, width)
         out[y] = zero
         if albedo.size:
             interpolate_row(other_albedo, places, colors)
@@ -354,11 +318,10 @@ def _agree(
 ) -> None:  # fmt: skip
     """Multiply the agreement of motion, albedo and normal; the reverse flow is left out if it has no rows."""
     zero, one, width = np.float32(0), np.float32(1), out.shape[1]
-    places, back, near = empty_places(width), np.empty((2, width), np.float32), np.empty(width, np.bool_)
-    _, _, _, fx, fy = places
+    back, near = np.empty((2, width), np.float32), np.empty(width, np.bool_)
     painted, bent, paint, bend = np.empty(width, np.float32), np.empty(width, np.float32), share[0], share[1]
     for y in range(first, last):
-        locate_row(flow, y, (first_row, 0), width, height, places)
+        places = locate_row(flow, y, (first_row, 0), width, height, width)
         near[:] = True
         if reverse.size:
             interpolate_row(reverse, places, back)
@@ -371,7 +334,7 @@ def _agree(
                 length = np.sqrt(u * u + v * v)
                 near[x] = error**2 < np.float32(0.01) * (length**2 + (length + error) ** 2) + np.float32(0.5)
         for x in range(width):
-            whole = weigh_whole(fx[x], fy[x])
+            whole = weigh_whole(places.fx[x], places.fy[x])
             painted[x] = max(distance[y, x, 0] - whole * paint * outlines[y, x, 0], zero)
             bent[x] = max(distance[y, x, 1] - whole * bend * outlines[y, x, 1], zero)
             near[x] &= max(distance[y, x, 0], distance[y, x, 1]) < _LARGEST
@@ -396,21 +359,9 @@ def mix_centre(
             f"warped has shape {warped.shape}, confidence {confidence.shape}, expected those of centre, {centre.shape}"
         )
     mixed = np.empty(centre.shape, np.float32) if out is None else out
-    planes = (*centre.shape[:2], -1)
-    warped, centre, confidence = (np.asarray(layer, np.float32) for layer in (warped, centre, confidence))
-    layers = warped.reshape(planes), centre.reshape(planes), confidence, mixed.reshape(planes)
-    run_bands(_mix, len(centre), *layers)
+    mixed[...] = centre
+    weight = np.asarray(confidence, np.float32).reshape(*confidence.shape, *[1] * (centre.ndim - 2))
+    known = np.broadcast_to(weight > 0, mixed.shape)
+    np.multiply(mixed, 1 - weight, out=mixed, where=known)
+    np.add(mixed, np.multiply(weight, warped, where=known, out=np.zeros_like(mixed)), out=mixed, where=known)
     return mixed
-
-
-@njit(nogil=True, cache=True)
-def _mix(
-    first: int, last: int, warped: np.ndarray, centre: np.ndarray, confidence: np.ndarray, out: np.ndarray
-) -> None:
-    for y in range(first, last):
-        for x in range(out.shape[1]):
-            weight = confidence[y, x]
-            for channel in range(out.shape[2]):
-                out[y, x, channel] = centre[y, x, channel]
-                if weight > 0:
-                    out[y, x, channel] = weight * warped[y, x, channel] + (np.float32(1) - weight) * out[y, x, channel]

@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from flow.warp import interpolate, locate, warp, weigh
-from loops.parallel import run_bands
+from flow.warp import warp
 
 # Longer than any frame is wide: renderers write 1e9, 1e10 or similar where motion is unknown.
 ABSURD_LENGTH = 1e4
@@ -146,22 +145,15 @@ def _decode(vectors: np.ndarray, convention: MotionConvention) -> np.ndarray:
 
 def _to_pixels(decoded: np.ndarray, unit: np.ndarray) -> Vectors:
     """Convert to pixels; 0 and False where a vector is not finite or absurdly long."""
-    vectors = Vectors(np.empty(decoded.shape, np.float32), np.empty(decoded.shape[:2], np.bool_))
-    run_bands(_scale, len(decoded), decoded[..., 0], decoded[..., 1], unit, *vectors)
-    return vectors
-
-
-@njit(nogil=True, cache=True)
-def _scale(
-    first: int, last: int, x_of: np.ndarray, y_of: np.ndarray, unit: np.ndarray, flow: np.ndarray, valid: np.ndarray
-) -> None:
-    longest, zero = np.float32(ABSURD_LENGTH), np.float32(0)
-    for y in range(first, last):
-        for x in range(valid.shape[1]):
-            u, v = x_of[y, x] * unit[0], y_of[y, x] * unit[1]
-            known = abs(u) <= longest and abs(v) <= longest  # NaN compares false
-            valid[y, x] = known
-            flow[y, x, 0], flow[y, x, 1] = u if known else zero, v if known else zero
+    flow, valid = np.empty(decoded.shape, np.float32), np.ones(decoded.shape[:2], bool)
+    for axis in (0, 1):  # by planes: numpy takes long over so short an axis
+        with np.errstate(over="ignore", invalid="ignore"):
+            part = decoded[..., axis] * unit[axis]
+        flow[..., axis] = part
+        valid &= np.abs(part, out=part) <= ABSURD_LENGTH  # NaN compares false
+    if not valid.all():
+        flow[~valid] = 0
+    return Vectors(flow, valid)
 
 
 def compose_flow(
@@ -186,31 +178,13 @@ def compose_flow(
     """
     if first.shape != second.shape:
         raise ValueError(f"first has shape {first.shape}, expected that of second, {second.shape}")
-    shape = first.shape[:2]
-    masks = [np.ones(shape, np.bool_) if mask is None else mask for mask in (first_valid, second_valid)]
-    flow, valid = np.empty((*shape, 2), np.float32), np.empty(shape, np.bool_)
-    vectors = [np.ascontiguousarray(part, np.float32) for part in (first, second)]
-    run_bands(_compose, shape[0], *vectors, *(np.ascontiguousarray(mask) for mask in masks), flow, valid)
+    flow, valid = warp(second, first)
+    flow += first
+    if first_valid is not None:
+        valid &= first_valid
+    if second_valid is not None and not second_valid.all():
+        valid &= warp(~second_valid, first)[0] == 0  # any invalid vector in the bilinear mix is too much
     return flow, valid
-
-
-@njit(nogil=True, cache=True)
-def _compose(
-    begin: int, end: int, first: np.ndarray, second: np.ndarray, first_valid: np.ndarray, second_valid: np.ndarray,
-    flow: np.ndarray, valid: np.ndarray,
-) -> None:  # fmt: skip
-    height, width = valid.shape
-    for y in range(begin, end):
-        for x in range(width):
-            u, v = first[y, x, 0], first[y, x, 1]
-            place = locate(np.float32(x) + u, np.float32(y) + v, width, height)
-            weights = weigh(place)
-            flow[y, x, 0] = u + interpolate(second, 0, place, weights)
-            flow[y, x, 1] = v + interpolate(second, 1, place, weights)
-            x0, y0, x1, y1 = np.uintp(place.x0), np.uintp(place.y0), np.uintp(place.x1), np.uintp(place.y1)
-            # Any invalid vector in the bilinear mix is too much.
-            known = second_valid[y0, x0] and second_valid[y0, x1] and second_valid[y1, x0] and second_valid[y1, x1]
-            valid[y, x] = place.inside and known and first_valid[y, x]
 
 
 @njit(nogil=True, cache=True)

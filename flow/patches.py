@@ -6,12 +6,10 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from numba import njit
 
 from flow.guide import estimate_noise, median_luminance, tone_map
 from flow.motion import ABSURD_LENGTH, MotionConvention, decode_motion
 from flow.tvl1 import rough_flow
-from flow.warp import locate
 
 # Patches of 9 x 9 pixels: the noise of their means is a ninth of a pixel's.
 RADIUS = 4
@@ -185,39 +183,42 @@ class Patches:
         """Costs of the patches `at`: centre and neighbour are the frames of these indices, `order`."""
         pictures = tuple(self.pictures[index] for index in order)
         lit = tuple((shown or self.shown)[index] for index in order)
-        difference = np.empty(len(at), np.float32)
-        _compare(pictures, lit, np.ascontiguousarray(flow), unit, self.rows[at], self.columns[at], difference)
+        difference = _compare(pictures, lit, flow * unit, self.rows[at], self.columns[at])
         return np.asarray(np.minimum(np.square(difference / self.scale[at]), 1))
 
 
-@njit(nogil=True, cache=True)
 def _compare(
-    pictures: tuple[np.ndarray, ...], shown: tuple[np.ndarray, ...], flow: np.ndarray, unit: np.ndarray,
-    rows: np.ndarray, columns: np.ndarray, difference: np.ndarray,
-) -> None:  # fmt: skip
-    """Mean of other(x + v) − centre(x), v = unit · flow, over the lit part of patches; NaN where half of it leaves.
+    pictures: tuple[np.ndarray, ...], shown: tuple[np.ndarray, ...], flow: np.ndarray, rows: np.ndarray,
+    columns: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Mean of other(x + v) − centre(x) over the lit part of patches; NaN where half of it leaves.
 
     Times the root of the lit share, as the mean of fewer pixels has more noise.
     """
-    centre, other = pictures
-    height, width = other.shape
-    size, one = flow.shape[1], np.float32(1)
-    for p in range(len(rows)):
-        total, count, lit = np.float32(0), 0, 0
-        for j in range(size):
-            for i in range(size):
-                y, x = rows[p] - size // 2 + j, columns[p] - size // 2 + i
-                if not shown[0][y, x]:
-                    continue
-                lit += 1
-                u, v = unit[0] * flow[p * size + j, i, 0], unit[1] * flow[p * size + j, i, 1]
-                inside, x0, y0, x1, y1, fx, fy = locate(np.float32(x) + u, np.float32(y) + v, width, height)
-                if inside and shown[1][y0, x0] and shown[1][y1, x1]:
-                    total -= centre[y, x]
-                    total += (one - fy) * ((one - fx) * other[y0, x0] + fx * other[y0, x1])
-                    total += fy * ((one - fx) * other[y1, x0] + fx * other[y1, x1])
-                    count += 1
-        difference[p] = total / (np.sqrt(count) * size) if count > 0 and 2 * count >= lit else np.nan
+    size, (height, width), reach = flow.shape[1], pictures[1].shape, np.arange(flow.shape[1]) - flow.shape[1] // 2
+    centre, other, own_lit, other_lit = (layer.ravel() for layer in (*pictures, *shown))
+    y, x = rows[:, None, None] + reach[:, None], columns[:, None, None] + reach
+    here, ends = y * width + x, flow.reshape(len(rows), size, size, 2)
+    lit = own_lit[here]
+    known, pixels, parts = lit.copy(), [], []
+    for place, axis, last in ((y, 1, np.float32(height - 1)), (x, 0, np.float32(width - 1))):
+        end = place.astype(np.float32) + ends[..., axis]
+        known &= (end >= -0.5) & (end <= last + np.float32(0.5))  # NaN compares false
+        end = np.fmin(np.fmax(end, 0), last)
+        first = end.astype(np.intp)
+        parts.append(end - first.astype(np.float32))
+        pixels.append(first)
+    (y0, x0), (fy, fx) = pixels, parts
+    first, across, down = y0 * width + x0, fx > 0, (fy > 0) * width
+    last_pixel = first + down + across
+    known &= other_lit[first] & other_lit[last_pixel]
+    above = other[first] + fx * (other[first + across] - other[first])
+    below = other[first + down] + fx * (other[last_pixel] - other[first + down])
+    found = above + fy * (below - above) - centre[here]
+    total = np.where(known, found, np.float32(0)).reshape(len(rows), -1).sum(axis=1)
+    count, most = (np.count_nonzero(mask.reshape(len(rows), -1), axis=1) for mask in (known, lit))
+    enough = (count > 0) & (2 * count >= most)
+    return np.where(enough, total / (np.sqrt(np.maximum(count, 1)) * size), np.nan).astype(np.float32)
 
 
 def _lit_box(lit: np.ndarray) -> tuple[slice, slice]:

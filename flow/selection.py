@@ -4,11 +4,9 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numba import njit
 
 from flow.guide import GuidePair
-from flow.warp import empty_places, interpolate_row, locate_row
-from loops.parallel import run_bands
+from flow.warp import warp
 
 # Share of the incumbent's error by which another flow must be better.
 _MARGIN = 0.15
@@ -58,11 +56,11 @@ def select_flow(
     for index, candidate in enumerate(candidates):
         if candidate.shape != (*shape, 2):
             raise ValueError(f"candidates[{index}] has shape {candidate.shape}, expected {(*shape, 2)}")
-        error = np.empty(shape, np.float32)
-        vectors = np.ascontiguousarray(candidate, np.float32)
-        layers = guides.centre, guides.neighbour, scale, vectors, error, evidence
-        run_bands(_photometric_error, shape[0], *layers)
-        errors.append(error)
+        moved, inside = warp(guides.neighbour, candidate)
+        evidence &= inside
+        moved -= guides.centre
+        np.multiply(np.abs(moved, out=moved), scale, out=moved)
+        errors.append(np.minimum(sum(moved[..., g] for g in range(scale.shape[-1])), np.float32(5)))
     errors = [error * evidence for error in errors]
     incumbent = _find_incumbent([_box_mean(error, _WIDE_BOX) for error in errors], chance)
     errors = [_box_mean(error, _BOX) for error in errors]
@@ -92,24 +90,3 @@ def _find_incumbent(errors: Sequence[np.ndarray], chance: np.ndarray) -> int:
 
 def _box_mean(image: np.ndarray, side: int) -> np.ndarray:
     return cv2.blur(image, (side, side)).reshape(image.shape)
-
-
-@njit(nogil=True, cache=True)
-def _photometric_error(
-    first: int, last: int, centre: np.ndarray, neighbour: np.ndarray, scale: np.ndarray, flow: np.ndarray,
-    error: np.ndarray, evidence: np.ndarray,
-) -> None:  # fmt: skip
-    """Measure min(5, Σ_g |I₁(x + f) − I₀(x)| · scale); clear `evidence` where the flow leaves the frame."""
-    height, width, channels = centre.shape
-    places, planes, total = empty_places(width), np.empty((channels, width), np.float32), np.empty(width, np.float32)
-    for y in range(first, last):
-        locate_row(flow, y, (0, 0), width, height, places)
-        interpolate_row(neighbour, places, planes)
-        total[:] = 0
-        for g in range(channels):
-            values = planes[g]
-            for x in range(width):
-                total[x] += abs(values[x] - centre[y, x, g]) * scale[y, x, g]
-        for x in range(width):
-            evidence[y, x] &= places.inside[x]
-            error[y, x] = min(total[x], np.float32(5))

@@ -9,7 +9,7 @@ from numba import njit
 
 from flow.guide import GuidePair, pair_guides, smooth_tones
 from flow.selection import select_flow
-from flow.warp import interpolate, locate, weigh
+from flow.warp import warp_block
 from loops.parallel import run_bands
 
 # Coupling of the data and the smoothness half of the energy (Zach's theta), and step of the dual ascent;
@@ -267,27 +267,14 @@ def _solve_block(
 
 def _with_gradients(planes: np.ndarray) -> np.ndarray:
     """Interleave (H, W, G) with its central differences in x and y, halved across the edge."""
-    height, width, channels = planes.shape
-    out = np.empty((height, width, 3 * channels), np.float32)
-    run_bands(_add_gradients, height, planes, out)
-    return out
+    beside, difference = np.ones(1, np.float32), np.array([-0.5, 0, 0.5], np.float32)
+    slopes = (
+        cv2.sepFilter2D(planes, -1, across, down, borderType=cv2.BORDER_REPLICATE).reshape(planes.shape)
+        for across, down in ((difference, beside), (beside, difference))
+    )
+    return np.stack([planes, *slopes], axis=-1).reshape(*planes.shape[:2], -1)
 
 
-@njit(nogil=True, cache=True)
-def _add_gradients(first: int, last: int, planes: np.ndarray, out: np.ndarray) -> None:
-    height, width, channels = planes.shape
-    half = np.float32(0.5)
-    for y in range(first, last):
-        above, below = max(y - 1, 0), min(y + 1, height - 1)
-        for x in range(width):
-            left, right = max(x - 1, 0), min(x + 1, width - 1)
-            for g in range(channels):
-                out[y, x, 3 * g] = planes[y, x, g]
-                out[y, x, 3 * g + 1] = half * (planes[y, right, g] - planes[y, left, g])
-                out[y, x, 3 * g + 2] = half * (planes[below, x, g] - planes[above, x, g])
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
 def _linearize(
     first: int, last: int, neighbour: np.ndarray, centre: np.ndarray, noise: np.ndarray, base: np.ndarray,
     change: np.ndarray, corner: tuple[int, int], attachment: np.float32, data: np.ndarray,
@@ -297,30 +284,21 @@ def _linearize(
     The guides come with their gradients, (H, W, 3 G), the neighbour's of the whole frame. `data` is (4, G, H, W): the
     difference without a change, its slope in x and in y, all over the length of the slope, and the bound of a step.
     """
-    _, width, channels = noise.shape
-    frame_height, frame_width = neighbour.shape[:2]
-    half = np.float32(0.5)
-    for y in range(first, last):
-        for x in range(width):
-            u, v = change[0, y, x], change[1, y, x]
-            px, py = np.float32(corner[1] + x) + base[y, x, 0] + u, np.float32(corner[0] + y) + base[y, x, 1] + v
-            place = locate(px, py, frame_width, frame_height)
-            weights = weigh(place)
-            for g in range(channels):
-                value = interpolate(neighbour, 3 * g, place, weights)
-                slope_x = interpolate(neighbour, 3 * g + 1, place, weights)
-                slope_y = interpolate(neighbour, 3 * g + 2, place, weights)
-                # The mean of both frames' gradients: exact to second order, and half as noisy.
-                ax = half * (slope_x + centre[y, x, 3 * g + 1])
-                ay = half * (slope_y + centre[y, x, 3 * g + 2])
-                square = ax * ax + ay * ay
-                # A gradient at the level of the noise says nothing about motion.
-                trust = square / (square + noise[y, x, g] * noise[y, x, g] + np.float32(1e-9))
-                # 1e-9: a slope of 3e-5 of the guide's range per pixel, below what 8 bits distinguish from flat.
-                length = np.sqrt(square + np.float32(1e-9))
-                data[0, g, y, x] = (value - centre[y, x, 3 * g] - ax * u - ay * v) / length
-                data[1, g, y, x], data[2, g, y, x] = ax / length, ay / length
-                data[3, g, y, x] = _THETA * attachment * trust * length if place.inside else np.float32(0)
+    rows = slice(first, last)
+    u, v = change[:, rows]
+    moved, inside = warp_block(neighbour, base[rows] + np.stack([u, v], axis=-1), (corner[0] + first, corner[1]))
+    for g in range(noise.shape[2]):
+        own, there = (planes[..., 3 * g : 3 * g + 3].transpose(2, 0, 1) for planes in (centre[rows], moved))
+        # The mean of both frames' gradients: exact to second order, and half as noisy.
+        ax, ay = np.float32(0.5) * (there[1:] + own[1:])
+        square = ax * ax + ay * ay
+        # A gradient at the level of the noise says nothing about motion.
+        trust = square / (square + np.square(noise[rows, :, g]) + np.float32(1e-9))
+        # 1e-9: a slope of 3e-5 of the guide's range per pixel, below what 8 bits distinguish from flat.
+        length = np.sqrt(square + np.float32(1e-9))
+        data[0, g, rows] = (there[0] - own[0] - ax * u - ay * v) / length
+        data[1, g, rows], data[2, g, rows] = ax / length, ay / length
+        data[3, g, rows] = np.where(inside, _THETA * attachment * trust * length, np.float32(0))
 
 
 def _iterate(

@@ -15,68 +15,43 @@ Four = tuple[Any, Any, Any, Any]
 _BETWEEN = np.float32(1 / 8)
 
 
-class Place(NamedTuple):
-    """Whether a position is in the frame, its four pixels, and its fractions from the first pixel (x0, y0)."""
-
-    inside: np.bool_
-    x0: int
-    y0: int
-    x1: int
-    y1: int
-    fx: np.float32
-    fy: np.float32
-
-
-@njit(nogil=True)
-def locate(px: np.float32, py: np.float32, width: int, height: int) -> Place:
-    """Find the four pixels around a position, from the centre of the first pixel; outside the frame those of its edge.
-
-    NaN and infinities are outside.
-    """
-    # Written so that a NaN or infinite position fails the test.
-    inside = px >= -0.5 and px <= width - 0.5 and py >= -0.5 and py <= height - 0.5
-    # Clamping the position is the same as repeating the edge; NaN falls to 0.
-    px = min(px, np.float32(width - 1)) if px > 0 else np.float32(0)
-    py = min(py, np.float32(height - 1)) if py > 0 else np.float32(0)
-    x0, y0 = int(px), int(py)
-    fx, fy = px - np.float32(x0), py - np.float32(y0)
-    # A neighbour of weight 0 is not read: on whole-pixel motion it could only bring in a NaN.
-    x1 = x0 + 1 if fx > 0 else x0
-    y1 = y0 + 1 if fy > 0 else y0
-    return Place(inside, x0, y0, x1, y1, fx, fy)
-
-
 class RowOfPlaces(NamedTuple):
-    """As `Place`, of all positions of a row, each of n values: several are computed at once."""
+    """Whether positions are in the frame, their first pixels (x0, y0) of four, and their fractions from these.
+
+    Arrays of n values, of which several are computed at once. The second column of pixels is x0 + 1 where fx is above
+    0, and x0 elsewhere, so that on whole-pixel motion a neighbour of weight 0 cannot bring in a NaN; rows alike.
+    """
 
     inside: np.ndarray  # bool
-    x0: np.ndarray  # int32; x1 is x0 + 1 where fx is above 0, and x0 elsewhere
+    x0: np.ndarray  # int32
     y0: np.ndarray
     fx: np.ndarray  # float32
     fy: np.ndarray
 
 
 @njit(nogil=True)
-def empty_places(size: int) -> RowOfPlaces:
-    """Places that `locate_row` has not written yet."""
-    pixels, fractions = np.empty((2, size), np.int32), np.empty((2, size), np.float32)
-    return RowOfPlaces(np.empty(size, np.bool_), pixels[0], pixels[1], fractions[0], fractions[1])
+def locate_row(flow: np.ndarray, y: int, corner: tuple[int, int], width: int, height: int, count: int) -> RowOfPlaces:
+    """Find the pixels around the ends of a row of vectors, from the centre of the first pixel.
 
-
-@njit(nogil=True)
-def locate_row(flow: np.ndarray, y: int, corner: tuple[int, int], width: int, height: int, places: RowOfPlaces) -> None:
-    """`locate` the ends of a row of vectors; those of an empty flow are 0. `corner`: where the flow begins."""
-    inside, x0, y0, fx, fy = places
+    Those of an empty flow are `count` vectors of 0. `corner` is where the flow begins. Positions outside the frame have
+    the pixels of its edge; NaN and infinities are outside.
+    """
+    inside, pixels = np.empty(count, np.bool_), np.empty((2, count), np.int32)
+    fractions = np.empty((2, count), np.float32)
+    x0, y0, fx, fy = pixels[0], pixels[1], fractions[0], fractions[1]
     half, zero, top, left = np.float32(0.5), np.float32(0), corner[0] + y, corner[1]
     right, bottom = np.float32(width - 1), np.float32(height - 1)
-    for x in range(len(x0)):
+    for x in range(count):
         px, py = np.float32(left + x), np.float32(top)
         if flow.size:
             px, py = px + flow[y, x, 0], py + flow[y, x, 1]
+        # Written so that a NaN or infinite position fails the test.
         inside[x] = (px >= -half) & (px <= right + half) & (py >= -half) & (py <= bottom + half)
+        # Clamping the position is the same as repeating the edge; NaN falls to 0.
         px, py = min(px, right) if px > zero else zero, min(py, bottom) if py > zero else zero
         x0[x], y0[x] = np.int32(px), np.int32(py)
         fx[x], fy[x] = px - np.float32(x0[x]), py - np.float32(y0[x])
+    return RowOfPlaces(inside, x0, y0, fx, fy)
 
 
 @njit(nogil=True)
@@ -118,45 +93,25 @@ def at_whole_pixels(flow: np.ndarray) -> np.ndarray:
     return near
 
 
-@njit(nogil=True)
-def weigh(place: Place) -> tuple[np.float32, np.float32, np.float32, np.float32]:
-    """Bilinear weights of the four pixels around a position, row by row."""
-    one = np.float32(1)
-    fx, fy = place.fx, place.fy
-    return (one - fy) * (one - fx), (one - fy) * fx, fy * (one - fx), fy * fx
-
-
-@njit(nogil=True)
-def interpolate(
-    image: np.ndarray, channel: int, place: Place, weights: tuple[np.float32, np.float32, np.float32, np.float32]
-) -> np.float32:
-    """Sample a channel bilinearly at a place of `locate` with the weights of `weigh`."""
-    # Unsigned: with a signed index numba tests each time whether it counts from the end.
-    x0, y0, x1, y1 = np.uintp(place.x0), np.uintp(place.y0), np.uintp(place.x1), np.uintp(place.y1)
-    value: np.float32 = (
-        weights[0] * image[y0, x0, channel] + weights[1] * image[y0, x1, channel]
-        + weights[2] * image[y1, x0, channel] + weights[3] * image[y1, x1, channel]
-    )  # fmt: skip
-    return value
-
-
 @njit(nogil=True, cache=True)
 def _bilinear(
-    first: int, last: int, image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarray, inside: np.ndarray
-) -> None:
+    first: int, last: int, image: np.ndarray, flow: np.ndarray, corner: tuple[int, int], out: np.ndarray,
+    inside: np.ndarray,
+) -> None:  # fmt: skip
     height, width, channels = image.shape
+    one, zero, count = np.float32(1), np.float32(0), out.shape[1]
     flat, result = image.reshape(-1), out.reshape(-1)
     column, row = np.uintp(channels), np.uintp(width * channels)
     for y in range(first, last):
-        for x in range(width):
-            place = locate(np.float32(x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1], width, height)
-            inside[y, x] = place.inside
-            weights = weigh(place)
-            above, below = np.uintp(place.y0) * row, np.uintp(place.y1) * row
-            left, right = np.uintp(place.x0) * column, np.uintp(place.x1) * column
-            corners = above + left, above + right, below + left, below + right
-            here = np.uintp(y) * row + np.uintp(x) * column
-            if channels == 3 and x + 1 < width and corners[3] + np.uintp(3) < np.uintp(len(flat)):
+        inside[y], x0, y0, all_fx, all_fy = locate_row(flow, y, corner, width, height, count)
+        for x in range(count):
+            fx, fy = all_fx[x], all_fy[x]
+            weights = (one - fy) * (one - fx), (one - fy) * fx, fy * (one - fx), fy * fx
+            start = np.uintp(y0[x]) * row + np.uintp(x0[x]) * column
+            right, down = column if fx > zero else np.uintp(0), row if fy > zero else np.uintp(0)
+            corners = start, start + right, start + down, start + down + right
+            here = (np.uintp(y) * np.uintp(count) + np.uintp(x)) * column
+            if channels == 3 and x + 1 < count and corners[3] + np.uintp(3) < np.uintp(len(flat)):
                 # As in `_bicubic`: four values at once.
                 red = _mix(flat, np.uintp(0), corners, weights)
                 green = _mix(flat, np.uintp(1), corners, weights)
@@ -169,20 +124,28 @@ def _bilinear(
                     result[here + c] = _mix(flat, c, corners, weights)
 
 
-@njit(nogil=True, cache=True)
+def ends_inside(flow: np.ndarray, shape: tuple[int, ...], first_row: int) -> np.ndarray:
+    """Where vectors (h, W, 2), of rows from `first_row` on, end in a frame of a shape (H, W); NaN ends outside."""
+    x = flow[..., 0] + np.arange(flow.shape[1], dtype=np.float32)
+    y = flow[..., 1] + np.arange(first_row, first_row + len(flow), dtype=np.float32)[:, None]
+    inside: np.ndarray = (x >= -0.5) & (x <= shape[1] - 0.5)
+    inside &= (y >= -0.5) & (y <= shape[0] - 0.5)
+    return inside
+
+
 def _nearest(
-    first: int, last: int, image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarray, inside: np.ndarray
-) -> None:
-    height, width, channels = image.shape
-    half = np.float32(0.5)
-    for y in range(first, last):
-        for x in range(width):
-            inside[y, x], x0, y0, x1, y1, fx, fy = locate(
-                np.float32(x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1], width, height
-            )
-            row, column = y1 if fy >= half else y0, x1 if fx >= half else x0
-            for c in range(channels):
-                out[y, x, c] = image[row, column, c]
+    first: int, last: int, image: np.ndarray, flow: np.ndarray, corner: tuple[int, int], out: np.ndarray,
+    inside: np.ndarray,
+) -> None:  # fmt: skip
+    inside[first:last] = ends_inside(flow[first:last], image.shape, corner[0] + first)
+    pixels = []
+    starts = np.arange(corner[0] + first, corner[0] + last)[:, None], np.arange(corner[1], corner[1] + out.shape[1])
+    for place, size, axis in zip(starts, image.shape, (1, 0), strict=False):
+        end = place.astype(np.float32) + flow[first:last, :, axis]
+        end = np.where(end > 0, np.minimum(end, np.float32(size - 1)), np.float32(0))  # NaN falls to 0
+        pixel = end.astype(np.intp)
+        pixels.append(pixel + (end - pixel >= 0.5))
+    out[first:last] = image[tuple(pixels)]
 
 
 @njit(nogil=True)
@@ -218,24 +181,26 @@ def _sample_bicubic(image: np.ndarray, channel: Any, columns: Four, rows: Four, 
 # Unsigned: with a signed index numba tests each time whether it counts from the end.
 @njit(nogil=True, cache=True)
 def _bicubic(
-    first: int, last: int, image: np.ndarray, flow: np.ndarray, first_row: int, out: np.ndarray, inside: np.ndarray
-) -> None:
+    first: int, last: int, image: np.ndarray, flow: np.ndarray, corner: tuple[int, int], out: np.ndarray,
+    inside: np.ndarray,
+) -> None:  # fmt: skip
     height, width, channels = image.shape
     flat, result = image.reshape(-1), out.reshape(-1)
     column, row = np.uintp(channels), np.uintp(width * channels)
+    count = out.shape[1]
     for y in range(first, last):
-        for x in range(width):
-            inside[y, x], x0, y0, x1, y1, fx, fy = locate(
-                np.float32(x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1], width, height
-            )
+        inside[y], all_x0, all_y0, all_fx, all_fy = locate_row(flow, y, corner, width, height, count)
+        for x in range(count):
+            x0, y0, fx, fy = int(all_x0[x]), int(all_y0[x]), all_fx[x], all_fy[x]
+            x1, y1 = x0 + 1 if fx > 0 else x0, y0 + 1 if fy > 0 else y0
             # A fraction of 0 has the weights (0, 1, 0, 0): read the one sample that counts.
             before, after = (max(x0 - 1, 0), min(x1 + 1, width - 1)) if fx > 0 else (x0, x0)
             above, below = (max(y0 - 1, 0), min(y1 + 1, height - 1)) if fy > 0 else (y0, y0)
             columns = np.uintp(before) * column, np.uintp(x0) * column, np.uintp(x1) * column, np.uintp(after) * column
             rows = np.uintp(above) * row, np.uintp(y0) * row, np.uintp(y1) * row, np.uintp(below) * row
             wx, wy = _catmull_rom(fx), _catmull_rom(fy)
-            here = np.uintp(y) * row + np.uintp(x) * column
-            if channels == 3 and x + 1 < width and rows[3] + columns[3] + np.uintp(3) < np.uintp(len(flat)):
+            here = (np.uintp(y) * np.uintp(count) + np.uintp(x)) * column
+            if channels == 3 and x + 1 < count and rows[3] + columns[3] + np.uintp(3) < np.uintp(len(flat)):
                 # Four values at once (SLP). The fourth is one of the next pixel, which is written after this one.
                 red = _sample_bicubic(flat, np.uintp(0), columns, rows, wx, wy)
                 green = _sample_bicubic(flat, np.uintp(1), columns, rows, wx, wy)
@@ -310,5 +275,12 @@ def warp(
     warped = result.reshape(*shape, source.shape[2])
     inside = np.empty(shape, np.bool_)
     vectors = np.ascontiguousarray(flow, np.float32)
-    run_bands(_KERNELS[interpolation], shape[0], source, vectors, first_row, warped, inside)
+    run_bands(_KERNELS[interpolation], shape[0], source, vectors, (first_row, 0), warped, inside)
     return result, inside
+
+
+def warp_block(image: np.ndarray, flow: np.ndarray, corner: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Warp a float32 image (H, W, C) bilinearly to a block (h, w, 2) at `corner`, as `warp`, on the calling thread."""
+    warped, inside = np.empty((*flow.shape[:2], image.shape[2]), np.float32), np.empty(flow.shape[:2], np.bool_)
+    _bilinear(0, len(flow), image, flow, corner, warped, inside)
+    return warped, inside

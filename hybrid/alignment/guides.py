@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numba import njit
 
-from flow.warp import locate, weigh_whole
+from flow.warp import locate_row, weigh_whole
 from hybrid.files.frame import Array
 from loops.parallel import run_bands
 
@@ -61,13 +61,12 @@ def _add(
     height, width, channels = layer.shape
     half, zero = np.float32(0.5), np.float32(0)
     for y in range(first, last):
+        _, x0, y0, fx, fy = locate_row(flow, y, (first_row, 0), width, height, width)
         for x in range(width):
             if not trust[y, x] > zero:
                 continue
-            place = locate(np.float32(x) + flow[y, x, 0], np.float32(first_row + y) + flow[y, x, 1], width, height)
-            weight = trust[y, x] * weigh_whole(place.fx, place.fy)
-            row = np.uintp(place.y1 if place.fy >= half else place.y0)
-            column = np.uintp(place.x1 if place.fx >= half else place.x0)
+            weight = trust[y, x] * weigh_whole(fx[x], fy[x])
+            row, column = np.uintp(y0[x] + np.int32(fy[x] >= half)), np.uintp(x0[x] + np.int32(fx[x] >= half))
             total[y, x] += weight
             for c in range(channels):
                 summed[y, x, c] += weight * layer[row, column, c]

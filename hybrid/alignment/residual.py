@@ -1,11 +1,11 @@
 """Noise of a neighbour at the pixels of the centre: its samples minus its first pass."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from flow.warp import empty_places, locate_row
+from flow.warp import locate_row
 from hybrid.alignment.transfer import ALBEDO_FLOOR
 from hybrid.files.frame import Array
 from loops.parallel import run_bands
@@ -84,26 +84,6 @@ def measure_limited(irradiance: Array, first_pass: Array, albedo: Array | None, 
 _NOTHING = Limited(np.empty((0, 0, 0), np.float32), cell_axis(1, 1), cell_axis(1, 1), np.float32(0))
 
 
-@njit(nogil=True, inline="always")
-def _limit(residual: Any, i: Any, light: Any) -> Any:
-    """Factor that limits the residual at index i to `RESIDUAL_LIMIT` times the light, in the mean over channels."""
-    limit = RESIDUAL_LIMIT * light
-    return limit / max(abs((residual[i] + residual[i + 1] + residual[i + 2]) / np.float32(3)), limit)
-
-
-@njit(nogil=True, inline="always")
-def _difference(irradiance: Any, first_pass: Any, albedo: Any, row: Any, column: Any, residual: Any) -> Any:
-    """Write irradiance − first pass of a pixel; return the first pass, in the mean over channels and at least 0."""
-    level, zero = np.float32(0), np.float32(0)
-    for c in range(3):
-        light = first_pass[row, column, c]
-        if albedo.size:
-            light /= max(albedo[row, column, c], zero) + _FLOOR
-        residual[c] = irradiance[row, column, c] - light
-        level += light
-    return max(level / np.float32(3), zero)
-
-
 @njit(nogil=True, cache=True, error_model="numpy")
 def _sum_limited(
     first: int, last: int, irradiance: Array, first_pass: Array, albedo: Array, exposure: np.float32, rows: Axis,
@@ -111,12 +91,21 @@ def _sum_limited(
 ) -> None:  # fmt: skip
     """Sum over cells the limited residuals per unit of light, and the light that the limit cuts off."""
     side, residual = len(rows.pixels) // sums.shape[1], np.empty(3, np.float32)
+    zero, third = np.float32(0), np.float32(3)
     for row in range(first, last):
         for y in rows.pixels[row * side : (row + 1) * side]:
             for column in range(sums.shape[2]):
                 for x in columns.pixels[column * side : (column + 1) * side]:
-                    light = _difference(irradiance, first_pass, albedo, y, x, residual) + exposure
-                    share = _limit(residual, np.uintp(0), light)
+                    level = zero
+                    for c in range(3):
+                        denoised = first_pass[y, x, c]
+                        if albedo.size:
+                            denoised /= max(albedo[y, x, c], zero) + _FLOOR
+                        residual[c] = irradiance[y, x, c] - denoised
+                        level += denoised
+                    light = max(level / third, zero) + exposure
+                    limit = RESIDUAL_LIMIT * light
+                    share = limit / max(abs((residual[0] + residual[1] + residual[2]) / third), limit)
                     for c in range(3):
                         sums[c, row, column] += share * residual[c] / light
                         sums[3 + c, row, column] += (np.float32(1) - share) * residual[c] / light
@@ -132,18 +121,21 @@ def _warp_residual(
     half, one, zero, third = np.float32(0.5), np.float32(1), np.float32(0), np.float32(3)
     lost, rows, columns, exposure = limited
     pixels, values = np.uintp(out.shape[1]), np.uintp(3 * out.shape[1])
-    places, sources, light = empty_places(out.shape[1]), np.empty((2, pixels), np.int32), np.empty(pixels, np.float32)
-    _, x0, y0, fx, fy = places
-    residual, denoised, own = np.empty(values, np.float32), np.empty(values, np.float32), np.empty(values, np.float32)
+    sources, light = np.empty((2, pixels), np.int32), np.empty(pixels, np.float32)
+    layers, gathered = (irradiance, first_pass, albedo), np.empty((3, values), np.float32)
+    residual, denoised, own = gathered[0], gathered[1], gathered[2]
     for y in range(first, last):
-        locate_row(flow, y, (first_row, first_column), width, height, places)
+        _, x0, y0, fx, fy = locate_row(flow, y, (first_row, first_column), width, height, out.shape[1])
         for x in range(out.shape[1]):
             sources[0, x] = y0[x] + np.int32(fy[x] >= half)
             sources[1, x] = x0[x] + np.int32(fx[x] >= half)
-        _gather(irradiance, sources, residual)
-        _gather(first_pass, sources, denoised)
+        for n in range(3 if albedo.size else 2):
+            layer, target = layers[n], gathered[n]
+            for x in range(pixels):
+                red, row, column = np.uintp(3) * x, np.uintp(sources[0, x]), np.uintp(sources[1, x])
+                for c in range(np.uintp(3)):
+                    target[red + c] = layer[row, column, c]
         if albedo.size:
-            _gather(albedo, sources, own)
             for i in range(values):
                 own[i] = max(own[i], zero) + _FLOOR
                 denoised[i] /= own[i]
@@ -155,7 +147,8 @@ def _warp_residual(
                 light[x] = max((denoised[red] + denoised[red + 1] + denoised[red + 2]) / third, zero) + exposure
             for x in range(pixels):
                 red, row, column = np.uintp(3) * x, np.uintp(sources[0, x]), np.uintp(sources[1, x])
-                share = _limit(residual, red, light[x])
+                limit = RESIDUAL_LIMIT * light[x]
+                share = limit / max(abs((residual[red] + residual[red + 1] + residual[red + 2]) / third), limit)
                 above, below, down = np.uintp(rows.before[row]), np.uintp(rows.after[row]), rows.share[row]
                 left, right, across = (
                     np.uintp(columns.before[column]), np.uintp(columns.after[column]), columns.share[column]
@@ -173,12 +166,3 @@ def _warp_residual(
         else:
             for i in range(values):
                 result[i] = residual[i]
-
-
-@njit(nogil=True)
-def _gather(image: Any, sources: Any, values: Any) -> None:
-    """Copy the three channels of pixels, whose rows and columns are `sources` (2, n)."""
-    for x in range(np.uintp(sources.shape[1])):
-        row, column, i = np.uintp(sources[0, x]), np.uintp(sources[1, x]), np.uintp(3) * x
-        for c in range(np.uintp(3)):
-            values[i + c] = image[row, column, c]

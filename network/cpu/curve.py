@@ -53,7 +53,7 @@ def _map(loop: Callable[..., None], table: Floats, x: Tensor) -> Tensor:
 
 @lru_cache(maxsize=1)
 def encoding_table() -> Floats:
-    """Table of `on_curve`: value at each entry, and difference to the next entry, (K, 2)."""
+    """Table of the transfer curve: value at each entry, and difference to the next entry, (K, 2)."""
     return _tabulate(pu_forward, _LEAST, _GREATEST, _LOW_BITS)
 
 
@@ -79,20 +79,16 @@ def _look_up(bits: Any, table: Any, first: Any, low_bits: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def on_curve(y: Any, bits: Any, table: Any) -> Any:
-    """Evaluate the transfer curve at y of at least 0, which has these bits, with the `encoding_table`."""
-    if y < _LEAST:
-        return _A * y / _WHITE
-    if not y < _GREATEST:
-        return (_E * np.log(y + _F) + _G) / _WHITE
-    return _look_up(bits, table, _FIRST, _LOW_BITS)
-
-
-@njit(cache=True, nogil=True)
 def _encode(first: int, last: int, values: Floats, bits: NDArray[np.uint32], table: Floats, result: Floats) -> None:
     for y in range(first, last):
         for i in range(values.shape[1]):
-            result[y, i] = on_curve(values[y, i], bits[y, i], table)
+            value = values[y, i]
+            if value < _LEAST:
+                result[y, i] = _A * value / _WHITE
+            elif not value < _GREATEST:
+                result[y, i] = (_E * np.log(value + _F) + _G) / _WHITE
+            else:
+                result[y, i] = _look_up(bits[y, i], table, _FIRST, _LOW_BITS)
 
 
 @njit(cache=True, nogil=True)
