@@ -392,10 +392,10 @@ def test_neighbours_count_by_their_samples(tmp_path):
     shot = open_shot(scene.write(tmp_path / "a", edit=grain), frames="1007-1011")
     stream = FrameStream(shot, Rules(), PerFrame(lambda frame: frame.color))
     # 1 / 64, known to a fifth of it or so; a frame of fewer samples counts its neighbours in full.
-    assert stream.window(1009).samples == pytest.approx([1 / 64, 1 / 64, 1, 1 / 64, 1 / 64], rel=0.4)
-    assert stream.window(1010).samples == (1, 1, 1, 1, 1)
+    assert stream.window(1009).own_samples == pytest.approx([1 / 64, 1 / 64, 1, 1 / 64, 1 / 64], rel=0.4)
+    assert stream.window(1010).own_samples == (1, 1, 1, 1, 1)
     results = dict.fromkeys((1008, 1009, 1010), np.ones((180, 240, 3), np.float32))
-    assert stream.window_of_results(1009, results).samples == pytest.approx([1 / 64, 1, 1 / 64], rel=0.4)
+    assert stream.window_of_results(1009, results).own_samples == pytest.approx([1 / 64, 1, 1 / 64], rel=0.4)
     aligned = stream.align(1009)
     assert aligned.confidence[[0, 1, 3, 4]].max() < 1.4 / 64
     assert aligned.confidence[2].min() == 1
