@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hybrid.alignment.fireflies import REACH
+from hybrid.files.prefetch import Prefetcher
 from hybrid.files.replace import remove_leftovers
 from hybrid.files.shots import Shot, output_path
 from hybrid.files.sources import MADE_FROM, Source, describe_sources, why_stale
 from hybrid.plan import Plan, Rules
-from hybrid.prefetch import Prefetcher
 from hybrid.runtime.kept import Keeper
 from hybrid.runtime.timing import Timings
 from hybrid.stabilize import DenoiseWindow, FrameDenoiser, FrameResult

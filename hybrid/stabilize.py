@@ -143,7 +143,7 @@ class FrameDenoiser:
 
     def make(self, number: int) -> FrameResult:
         """Denoise a frame; ValueError or OSError if it, or a neighbour, fails, or its light is not the samples'."""
-        averaged = self.neighbours(number)
+        averaged = self.neighbours(number)  # the next frame among them: its window is denoised first
         # The result of the frame before keeps only the fields that the average reads.
         self._results = {n: _needed(result, n >= number) for n, result in self._results.items() if n in averaged}
         for n in averaged:

@@ -154,9 +154,9 @@ def _align_denoised(
         gate = color_gate(estimates, irradiance, exposure)
         confidence = combine_confidence(aligned.confidence, coverage, gate, stages)
         del coverage, gate, pictures  # windows are large
-        for own, weight in zip(confidence, interpolation, strict=True):
+        for of_frame, weight in zip(confidence, interpolation, strict=True):
             if weight is not None:
-                own *= weight
+                of_frame *= weight
         if "gate" in stages:
             agreement = agreement_weight(estimates, irradiance, confidence, exposure)
             confidence[:middle] *= agreement
@@ -286,10 +286,10 @@ def _align_by_geometry(
         alpha = [frame.alpha] if "alpha" in stages and frame.alpha is not None else []
         return [*(getattr(frame, name) for name in names), *(frame.aovs[name] for name in centre.aovs), *alpha]
 
-    own = layers_of(centre)
-    warped = [np.empty((*shape, layer.shape[-1]), np.float32) for layer in own]
-    given = {"albedo": centre.albedo, "normal": centre.normal}
-    guides = {name: guide[rows] for name, guide in given.items() if guide is not None}
+    centre_layers = layers_of(centre)
+    warped = [np.empty((*shape, layer.shape[-1]), np.float32) for layer in centre_layers]
+    layers = {"albedo": centre.albedo, "normal": centre.normal}
+    guides = {name: guide[rows] for name, guide in layers.items() if guide is not None}
     confidence, coverage = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     geometry: list[Geometry | None] = [None] * count
     with timings.stage("confidence"):
@@ -299,7 +299,7 @@ def _align_by_geometry(
     for index, (frame, link) in enumerate(zip(window.frames, window.links, strict=True)):
         if frame is None or link is None:
             # The centre itself, or a frame that is missing.
-            for out, layer in zip(warped, own, strict=True):
+            for out, layer in zip(warped, centre_layers, strict=True):
                 out[index] = layer[rows]
             if index == count // 2:
                 confidence[index] = coverage[index] = centre.valid[rows]

@@ -86,7 +86,7 @@ class Part:
         return self.header.get("type") in (OpenEXR.deepscanline, OpenEXR.deeptile)
 
     def would_lose(self, replaced: Collection[str]) -> str | None:
-        """Return the compression that would change channels kept beside `replaced`, alpha among them, or None."""
+        """Return the lossy codec that would re-encode channels that are kept, alpha among them, or None."""
         compression = self.header["compression"].name
         # DWA and its like keep alpha exactly.
         exact = {name for name in self.channels if component_of(name) == "A" and not compression.startswith("B44")}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hybrid.files.frame import Frame
-from hybrid.prefetch import Prefetcher
+from hybrid.files.prefetch import Prefetcher
 from hybrid.runtime.timing import Timings
 
 
