@@ -13,7 +13,6 @@ from hybrid.pseudo_reference import CLASSICAL_PRESETS, STANDARD
 from tests.hard_cases.hard import (
     MIDDLE,
     REACH,
-    STAGES,
     align,
     constant,
     denoise,
@@ -311,12 +310,3 @@ def test_guides_that_tell_nothing_do_no_harm(changes):
     assert np.isfinite(image).all()
     assert (image >= 0).all()
     assert within_range(window, image)
-
-
-@pytest.mark.neural
-def test_alpha_of_nought_stays_nought(network):
-    frames = [spoil(f, alpha=np.zeros(f.color.shape[:2], np.float32)) for f in shot()]
-    window = align(frames, stages=STAGES | {"alpha"}, first_pass=Classical(STANDARD))
-    done = network["float32"](window)
-    assert (done.aovs["alpha"] == 0).all()
-    assert np.isfinite(done.color).all()

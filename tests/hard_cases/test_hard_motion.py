@@ -5,7 +5,6 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from flow.motion import CYCLES, MotionConvention
 from hybrid.comparison.metrics import psnr
 from tests.hard_cases.hard import SCENE, STAGES, denoise, frame, shot, spoil, truth, within_range
 from tests.seldom import seldom
@@ -58,22 +57,3 @@ def test_wrong_vectors_cost_no_more_than_time(vectors, refine):
     assert within_range(window, image)
     # Half a decibel: what wrongly trusted pixels may cost. Walls of 4 px with 2 px of error look alike here and there.
     assert psnr(image, truth()) > psnr(alone(), truth()) - 0.5
-
-
-@pytest.mark.parametrize("convention", [CYCLES, MotionConvention()], ids=str)
-def test_half_of_the_vectors_are_enough(convention):
-    channels = convention.channels
-    frames = [
-        spoil(f, motion=np.ascontiguousarray(_backward(f.motion)[..., :channels]), motion_convention=convention)
-        for f in shot()
-    ]
-    window, image = denoise(frames)
-    assert within_range(window, image)
-    assert np.isfinite(image).all()
-
-
-def _backward(vectors):
-    """Cycles' vectors, of which the first two are those of a plain backward offset with y down."""
-    out = vectors.copy()
-    out[..., 1] *= -1
-    return out

@@ -15,7 +15,7 @@ from hybrid.files.shots import open_shot
 from tests.commands import words_in
 from tests.renderers import Channels, Truth, cycles_vector, layer, save, truths
 
-FRAMES = truths(np.s_[12:76, 24:120])
+FRAMES = truths(np.s_[20:68, 40:104])
 WEIGHTS = Path(__file__).parent.parent / "data" / "small.safetensors"
 
 
@@ -110,28 +110,21 @@ def bare(truth: Truth, eye: str = "", *, other: bool = False) -> Channels:
 
 @pytest.mark.parametrize("default", ["", "left"], ids=["multiView", "left and right"])
 def test_both_eyes_of_bare_channels_are_those_of_mono_files(
-    default: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    default: str, mono: dict[str, bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The left one was denoised twice and the right one never, or only the left one was denoised."""
     header = {} if default else {"multiView": ["left", "right"]}
     for truth in FRAMES:
         name = f"shot.{truth.number:04d}.exr"
-        save(tmp_path / "left" / name, bare(truth))
-        save(tmp_path / "right" / name, bare(truth, other=True))
         save(tmp_path / "both" / name, bare(truth, default) | bare(truth, "right", other=True), header)
-    mono = {eye: read_exr(run(tmp_path / eye, tmp_path / f"{eye}_out") / "shot.0010.exr") for eye in ("left", "right")}
     capsys.readouterr()
     both = read_exr(run(tmp_path / "both", tmp_path / "both_out") / "shot.0010.exr")
     first = f"{default}.RGB" if default else "RGB"
     assert f"pictures: {first}, right.RGB: each is denoised" in words_in(capsys.readouterr().err)
-    noisy = read_exr(tmp_path / "both" / "shot.0010.exr")
     for eye, end in (("left", f"{default}." if default else ""), ("right", "right.")):
-        for c in "RGB":
-            np.testing.assert_array_equal(both.channel(end + c), mono[eye].channel(c))
-            assert not np.array_equal(both.channel(end + c), noisy.channel(end + c))
+        assert b"".join(both.channel(end + c).tobytes() for c in "RGB") == mono[eye]
     right = run(tmp_path / "both", tmp_path / "chosen", "--layer", "color=right")
-    for c in "RGB":
-        np.testing.assert_array_equal(read_exr(right / "shot.0010.exr").channel(f"right.{c}"), mono["right"].channel(c))
+    assert color(right, "right") == mono["right"]
 
 
 def test_every_view_layer_is_denoised_or_the_one_that_was_chosen(

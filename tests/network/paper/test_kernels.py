@@ -139,7 +139,7 @@ def test_applying_kernels_against_loops(size: int, shape: tuple[int, int]) -> No
         torch.testing.assert_close(got, expected)
 
 
-@pytest.mark.parametrize("shape", [(3, 2), (1, 2)])
+@pytest.mark.parametrize("shape", [(2, 1), (1, 2)])
 def test_gradient_of_applying_kernels(shape: tuple[int, int]) -> None:
     kernels = uniform(2, 18, *shape).requires_grad_()
     frames = uniform(2, 2, 2, *shape, seed=1).requires_grad_()
