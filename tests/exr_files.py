@@ -1,7 +1,5 @@
 """New EXR files for tests and benchmarks."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Made-up shots whose truth is known."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Loops that a run of `balanced` has called: ``python -m tests.signatures`` writes `hybrid.runtime.signatures.FILE`."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -14,7 +14,6 @@ from hybrid.job import validate_views
 from tests.scenes import Scene
 
 SCENE = Scene(frames=5)
-MOTION = "cycles,pixels,y-up"  # of Blender's vectors
 
 
 @pytest.fixture

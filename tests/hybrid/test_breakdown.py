@@ -1,7 +1,5 @@
 """Maps in [0, 1] that show each stage where it ran and nowhere else."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

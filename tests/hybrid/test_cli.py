@@ -23,7 +23,6 @@ from hybrid.option_texts import option_texts
 from hybrid.plan import STAGES
 from hybrid.records import read_records
 from tests.commands import words_in
-from tests.exr_files import write_layers
 from tests.scenes import Scene, grained
 
 ALL = {name: LazyCommand(name, entry).load() for name, entry in COMMANDS.items()}
@@ -248,13 +247,6 @@ def test_each_command_shows_an_example(capsys, command):
     assert f"ravg {command} " in out.partition("Example")[2]
 
 
-def test_a_hole_is_a_warning_where_nobody_asked_for_it(shot_folder, tmp_path, capsys):
-    (shot_folder / "shot.1003.exr").rename(shot_folder / "shot.1004.exr")
-    code, _, err = run(capsys, "denoise", shot_folder, "-o", tmp_path / "o", "--preset", "draft")
-    assert code == 0
-    assert "warning: missing frames 1003" in err
-
-
 @pytest.mark.parametrize("keep_going", [False, True])
 def test_a_frame_that_was_asked_for_and_is_not_there_is_an_error(shot_folder, tmp_path, capsys, keep_going):
     (shot_folder / "shot.1002.exr").unlink()
@@ -315,24 +307,6 @@ def one_line_error(capsys, *arguments):
     return last
 
 
-def test_a_wrong_path_is_named(tmp_path, capsys):
-    assert "nowhere" in one_line_error(capsys, "inspect", tmp_path / "nowhere.####.exr")
-
-
-def test_a_missing_layer_is_named_with_those_there_are(shot_folder, capsys):
-    error = one_line_error(capsys, "inspect", shot_folder, "--layer", "color=RGBA_beauty")
-    assert "RGBA_beauty" in error
-    assert "ViewLayer.Combined" in error
-
-
-def test_frames_of_different_size_are_named(shot_folder, tmp_path, capsys):
-    Scene(height=44).write(tmp_path / "other")
-    os.replace(tmp_path / "other" / "shot.1002.exr", shot_folder / "shot.1002.exr")
-    out = tmp_path / "o"
-    assert "56x4" in one_line_error(capsys, "denoise", "--method=classical", shot_folder, "-o", out)
-    assert not list(out.glob("*.exr"))
-
-
 def test_fireflies_are_counted_in_every_window_they_are_in(tmp_path, capsys):
     def sparks(index, layers):
         if index == 1:
@@ -344,24 +318,6 @@ def test_fireflies_are_counted_in_every_window_they_are_in(tmp_path, capsys):
     assert code == 0, err
     ((_, report),) = read_records(out)
     assert report["outliers"] == 2 * 3  # two, in each of three windows; vectors are whole pixels
-
-
-def test_a_truncated_file_is_named_and_leaves_no_partial_output(tmp_path, capsys):
-    folder, out = Scene(frames=7).write(tmp_path / "in"), tmp_path / "o"
-    victim = folder / "shot.1007.exr"
-    victim.write_bytes(victim.read_bytes()[:-2000])
-    assert "shot.1007.exr" in one_line_error(capsys, "denoise", folder, "-o", out, "--preset", "draft")
-    # Windows of five frames: those without it are finished, and nothing else is there but the record.
-    finished = {path.name for path in out.iterdir()} - {"ravg"}
-    assert finished == {f"shot.{number}.exr" for number in range(1001, 1005)}
-    for name in finished:
-        assert read_exr(out / name).channel_names == read_exr(folder / name).channel_names
-
-
-def test_the_input_is_not_overwritten(shot_folder, capsys):
-    before = {path: path.read_bytes() for path in shot_folder.iterdir()}
-    assert "overwrite" in one_line_error(capsys, "denoise", "--method=classical", shot_folder, "-o", shot_folder)
-    assert {path: path.read_bytes() for path in shot_folder.iterdir()} == before
 
 
 @pytest.mark.parametrize("method", ["classical", pytest.param("network", marks=pytest.mark.neural)])
@@ -391,13 +347,6 @@ def test_the_input_is_not_overwritten_by_any_pass(shot_folder, tmp_path, capsys,
     assert "overwrite" in one_line_error(capsys, *words)
     assert {path: path.read_bytes() for path in shot_folder.iterdir()} == before
     assert not (tmp_path / "out").exists()  # it was refused before anything was made
-
-
-@pytest.mark.skipif(getattr(os, "geteuid", lambda: 0)() == 0, reason="root may write anywhere")
-def test_a_read_only_folder_is_named(shot_folder, tmp_path, capsys):
-    out = tmp_path / "o"
-    out.mkdir(mode=0o500)
-    assert str(out) in one_line_error(capsys, "denoise", "--method=classical", shot_folder, "-o", out)
 
 
 def test_an_output_that_is_a_file_is_named(shot_folder, tmp_path, capsys):
@@ -493,11 +442,6 @@ def test_the_bundled_network_makes_the_estimates_where_asked(shot_folder, tmp_pa
 def test_bad_usage_of_the_network_is_two(options, shot_folder, tmp_path, capsys, monkeypatch):
     pytest.importorskip("torch")
     test_bad_usage_is_two_and_makes_nothing(options, shot_folder, tmp_path, capsys, monkeypatch)
-
-
-def test_a_file_without_color_is_refused(tmp_path, capsys):
-    write_layers(tmp_path / "depth.exr", {"depth": np.ones((8, 8), np.float32)})
-    assert "color" in one_line_error(capsys, "inspect", tmp_path / "depth.exr")
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from hybrid.comparison.results import Comparison
 from hybrid.files.decode import decode_frame
 from hybrid.files.exr import read_exr
 from hybrid.files.replace import replace_file
-from hybrid.files.shots import open_matching_sequence, open_shot, output_path
+from hybrid.files.shots import open_matching_sequence, open_shot
 from hybrid.memory import MemoryPlan, plan_memory
 from hybrid.pipeline import View, denoise_frames
 from hybrid.plan import Rules
@@ -77,12 +77,6 @@ def test_a_first_pass_that_is_kept_is_that_of_the_forced_stages(denoise, tmp_pat
 def test_the_classical_first_pass_has_the_preset(denoise):
     draft, final = (color(denoise(preset, "--preset", preset, "--first-pass", "nlm")) for preset in ("draft", "final"))
     assert not np.array_equal(draft, final)
-
-
-@pytest.mark.oidn
-def test_the_device_of_the_first_pass_is_in_the_header(denoise):
-    pytest.importorskip("pyoidn")
-    assert settings(denoise("out", "--preset", "draft", "--first-pass", "oidn-fast"))["device"] == {"oidn": "cpu"}
 
 
 def test_memory_is_shared_between_the_views_of_a_file(tmp_path, monkeypatch):
@@ -161,13 +155,6 @@ def test_only_the_last_pass_resumes_keeps_going_and_counts_weights(shot_folder, 
     assert [run[0] is opened.denoiser for run in runs] == [False, True]
 
 
-def test_a_strict_run_refuses_holes(tmp_path):
-    folder = Scene(frames=4).write(tmp_path / "in")
-    (folder / "shot.1002.exr").unlink()
-    with pytest.raises(ValueError, match="missing frames 1002"):
-        job.validate_views(open_shot(folder), strict=True)
-
-
 @pytest.mark.neural
 def test_the_weights_of_a_bundled_first_pass_are_in_the_header(shot_folder, tmp_path):
     pytest.importorskip("torch")
@@ -182,17 +169,6 @@ def test_the_record_names_the_weights(denoise):
     out = denoise("out", "--weights", ROOT / "tests" / "data" / "small.safetensors")
     ((_, record),) = read_records(out)
     assert record["preset"] == "small.safetensors"
-
-
-def test_a_cut_is_said_once(tmp_path, capsys):
-    def edit(index, layers):
-        if index >= 3:
-            layers |= {name: np.ascontiguousarray(layer[::-1, ::-1]) for name, layer in layers.items()}
-
-    folder = Scene(frames=6, step=(0, 0)).write(tmp_path / "in", edit=edit)
-    assert main(["denoise", str(folder), "-o", str(tmp_path / "out"), "--preset", "draft"]) == 0
-    said = [line for line in capsys.readouterr().err.splitlines() if " cut" in line and "warning" in line]
-    assert len(said) == 1
 
 
 def test_chunks_of_a_cluster_resume_and_pictures_follow(shot_folder, tmp_path, monkeypatch):
@@ -232,17 +208,6 @@ def test_a_first_pass_that_cannot_be_kept_is_refused_by_its_own_option(shot_fold
     words = ["denoise", str(shot_folder), "-o", str(tmp_path / "out"), "--method", "classical"]
     assert main([*words, "--first-pass", "oidn-fast", "--keep-first-pass", str(tmp_path / "k.exr")]) == 1
     assert "error: keep-first-pass" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("keep_context", [False, True])
-def test_one_name_for_several_frames_is_refused_with_those_beside_them(shot_folder, tmp_path, keep_context):
-    """A first pass is kept of neighbours too."""
-    shot = open_shot(shot_folder, frames="1002")
-    if keep_context:
-        with pytest.raises(ValueError, match="names one file for 3 frames"):
-            output_path(tmp_path / "x.exr", shot, 1002, include_context=True)
-    else:
-        assert output_path(tmp_path / "x.exr", shot, 1002) == tmp_path / "x.exr"
 
 
 def test_a_report_has_the_options_of_compare(shot_folder, tmp_path, monkeypatch):

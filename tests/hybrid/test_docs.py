@@ -25,39 +25,11 @@ IDS = [str(page.relative_to(ROOT)) for page in PAGES]
 BLOCK = re.compile(r"(?:<!-- (?P<marker>[^>]*) -->\n)?```(?P<kind>\w*)\n(?P<text>.*?)\n```", re.DOTALL)
 # Options of other programs.
 FOREIGN = {
-    *(
-        "--break",
-        "--source-dir",
-        "--command",
-        "--background",
-        "--render",
-        "--keep",
-        "--replace",
-        "--addons",
-        "--python",
-    ),
-    *(
-        "--python-exit-code",
-        "--chnames",
-        "--chappend",
-        "--no-deps",
-        "--extra-index-url",
-        "--host",
-        "--port",
-        "--nworkers",
-        "--nthreads",
-    ),
-    *(
-        "--step",
-        "--nproc-per-node",
-        "--threads",
-        "--system-site-packages",
-        "--upgrade",
-        "--seed",
-        "--compact",
-    ),
-    *("--second-reference", "--sweep"),
-}
+    "--break", "--source-dir", "--command", "--background", "--render", "--keep", "--replace", "--addons", "--python",
+    "--python-exit-code", "--chnames", "--chappend", "--no-deps", "--extra-index-url", "--host", "--port",
+    "--nworkers", "--nthreads", "--step", "--nproc-per-node", "--threads", "--system-site-packages", "--upgrade",
+    "--seed", "--compact", "--second-reference", "--sweep", "--part",
+}  # fmt: skip
 
 
 def transcript(document: str, name: str) -> Iterator[tuple[list[str], list[str]]]:
@@ -144,7 +116,11 @@ RUN = [(page, lines) for page in PAGES for marker, lines in commands_of(page) if
 @pytest.mark.neural
 @pytest.mark.slow
 @pytest.mark.posix
-@pytest.mark.parametrize(("page", "lines"), RUN, ids=[page.name for page, _ in RUN])
+@pytest.mark.parametrize(
+    ("page", "lines"),
+    [RUN[0], *(pytest.param(*case, marks=pytest.mark.reliability) for case in RUN[1:])],
+    ids=[page.name for page, _ in RUN],
+)
 def test_commands_run(page, lines, folder):
     pytest.importorskip("torch")
     for line in lines:

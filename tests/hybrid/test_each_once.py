@@ -1,7 +1,5 @@
 """How many times each stage runs while ten frames are denoised: once for a frame, a pair or a window."""
 
-from __future__ import annotations
-
 import collections
 
 import pytest

@@ -1,6 +1,5 @@
 """Per-frame estimates: where they come from, and what time makes of them."""
 
-import importlib.util
 import os
 import re
 from dataclasses import replace
@@ -20,7 +19,7 @@ from hybrid.first_pass import Backends, Classical, GuideAware, PerFrame, find_fi
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import DRAFT, STANDARD, gated_average
 from hybrid.records import read_records
-from hybrid.stream import FrameStream, plan_shot
+from hybrid.stream import FrameStream
 from tests.exr_files import write_layers
 from tests.scenes import Scene, only
 
@@ -34,19 +33,6 @@ def flickering(frame, seed=0):
     rng = np.random.default_rng((seed, frame.number))
     truth = SCENE.clean(frame.number - SCENE.first)["ViewLayer.Combined"]
     return truth * np.float32(1 + 0.02 * rng.standard_normal())
-
-
-def test_each_frame_is_estimated_once_while_the_window_slides(tmp_path):
-    asked = []
-
-    def estimate(frame):
-        asked.append(frame.number)
-        return frame.color
-
-    aligner = FrameStream(open_shot(SCENE.write(tmp_path)), only(STAGES), first_pass=PerFrame(estimate))
-    for number in aligner.shot.numbers:
-        assert aligner.align(number).first_pass.shape == (5, SCENE.height, SCENE.width, 3)
-    assert sorted(asked) == list(aligner.shot.numbers)
 
 
 def test_our_own_estimate_of_a_frame_does_not_depend_on_the_window_it_is_asked_from(tmp_path):
@@ -189,16 +175,6 @@ def test_light_that_changes_is_not_averaged(tmp_path):
     assert errors[1] > 1  # dragged in from the bright frames
 
 
-@pytest.mark.parametrize("scale", [1e-4, 1e4])
-def test_the_average_scales_with_the_radiance(tmp_path, scale):
-    plain = gated_average(
-        FrameStream(open_shot(SCENE.write(tmp_path / "a")), only(STAGES), first_pass=Classical(DRAFT)).align(MIDDLE)
-    )
-    shot = open_shot(SCENE.write(tmp_path / "b", scale=scale))
-    scaled = gated_average(FrameStream(shot, only(STAGES), first_pass=Classical(DRAFT)).align(MIDDLE))
-    np.testing.assert_allclose(scaled, scale * plain, rtol=1e-3)
-
-
 def test_estimates_that_are_not_finite_are_repaired_and_others_refused(tmp_path):
     def broken(frame):
         image = flickering(frame)
@@ -246,13 +222,6 @@ def test_auto_takes_what_is_in_the_file_then_oidn_then_our_own(tmp_path, monkeyp
         find_first_pass("oidn-fast", plain)
 
 
-def test_what_cycles_has_denoised_is_taken_and_stays_what_it_is_at_the_centre(tmp_path):
-    shot = open_shot(SCENE.write(tmp_path, edit=denoised))
-    window = FrameStream(shot, only(STAGES), first_pass=find_first_pass("auto", shot).first_pass).align(MIDDLE)
-    truth = SCENE.clean(2)["ViewLayer.Combined"]
-    np.testing.assert_allclose(window.first_pass[2] * window.modulation, truth, rtol=1e-5)
-
-
 def test_a_finished_sequence_is_taken_frame_by_frame(tmp_path):
     shot = open_shot(SCENE.write(tmp_path / "noisy"))
     SCENE.write(tmp_path / "clean", clean=True, without={"Vector", "Depth"})
@@ -271,19 +240,6 @@ def test_of_a_sequence_that_cycles_has_denoised_the_denoised_picture_is_taken(tm
     SCENE.write(tmp_path / "cycles", edit=denoised)
     source = find_first_pass(str(tmp_path / "cycles"), shot)
     np.testing.assert_array_equal(source.first_pass.function(shot.read(MIDDLE)), SCENE.clean(2)["ViewLayer.Combined"])
-
-
-def test_pictures_that_are_kept_are_made_once(tmp_path, monkeypatch):
-    made = []
-    monkeypatch.setattr(first_pass, "why_no_oidn", lambda: None)
-    monkeypatch.setattr(first_pass, "denoise_oidn", lambda color, *_, **__: made.append(1) or 0.5 * color)
-    shot = open_shot(SCENE.write(tmp_path / "noisy"))
-    sources = [find_first_pass("oidn", shot, kept=str(tmp_path / "kept.####.exr")) for _ in range(2)]
-    images = [source.first_pass.function(shot.read(MIDDLE)) for source in sources]
-    assert len(made) == 1
-    assert (tmp_path / f"kept.{MIDDLE}.exr").is_file()
-    np.testing.assert_array_equal(images[0], images[1])
-    np.testing.assert_allclose(images[0], 0.5 * shot.read(MIDDLE).color, rtol=1e-3)
 
 
 def test_pictures_that_are_kept_are_made_again_where_they_would_be_others(tmp_path, monkeypatch):
@@ -349,15 +305,6 @@ def test_where_nothing_is_kept_the_reason_says_so(tmp_path):
         assert "kept" not in find_first_pass(spec, shot).reason
 
 
-@pytest.mark.skipif(importlib.util.find_spec("pyoidn") is None, reason="pyoidn is not installed")
-def test_oidn_estimates_come_out_stable(tmp_path):
-    shot = open_shot(SCENE.write(tmp_path))
-    window = FrameStream(shot, only(STAGES), first_pass=find_first_pass("oidn", shot).first_pass).align(MIDDLE)
-    truth = SCENE.clean(2)["ViewLayer.Combined"]
-    alone, stable = psnr(window.first_pass[2] * window.modulation, truth), psnr(gated_average(window), truth)
-    assert stable > alone > psnr(SCENE.noisy(2)["ViewLayer.Combined"], truth)
-
-
 def test_the_command_says_what_was_taken(tmp_path, capfd):
     folder = SCENE.write(tmp_path / "noisy", edit=denoised)
     out = tmp_path / "out"
@@ -396,13 +343,6 @@ def test_a_shot_as_blenders_defaults_render_it_just_works(tmp_path, capfd):
     pictures = [before.read(10).estimate, after.read(10).estimate]  # Combined is replaced, the Noisy Image stays
     np.testing.assert_array_equal(after.read(10).color, before.read(10).color)
     assert 30 < psnr(pictures[1], pictures[0]) < 60  # changed, and not by much
-
-
-def test_the_plan_sees_the_one_seed_of_blenders_defaults():
-    plan = plan_shot(open_shot(Path(__file__).parents[1] / "data" / "defaults"))
-    decision = next(d for d in plan.decisions if d.stage == "fixed-noise")
-    assert decision.on
-    assert "Animate Seed" in decision.reason
 
 
 def late(folder, by, step=(3, 1)):

@@ -1,7 +1,5 @@
 """The level of denoised pictures against that of their samples."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -14,7 +14,6 @@ from hybrid import job
 from hybrid.cli import main
 from hybrid.files.exr import read_exr
 from hybrid.job import PRESETS, DenoiseOptions, replace_options
-from hybrid.pipeline import Failed
 from hybrid.records import read_records
 from tests.scenes import Scene
 
@@ -37,15 +36,6 @@ def test_without_a_network_it_is_the_command(shot_folder, tmp_path, preset, esti
     assert [frame.number for frame in made] == [1001, 1002, 1003]
     words = ["denoise", str(shot_folder), "-o", str(tmp_path / "out"), "--preset", preset]
     assert main([*words, *(["--first-pass", estimate] if estimate else [])]) == 0
-    same(tmp_path / "made", tmp_path / "out")
-
-
-@pytest.mark.neural
-def test_with_a_network_it_is_the_command(shot_folder, tmp_path):
-    pytest.importorskip("torch")
-    shot = hybrid.open_shot(shot_folder)
-    assert len(list(hybrid.denoise_shot(shot, tmp_path / "made", preset="balanced", first_pass="nlm"))) == 3
-    assert main(["denoise", str(shot_folder), "-o", str(tmp_path / "out"), "--first-pass", "nlm"]) == 0
     same(tmp_path / "made", tmp_path / "out")
 
 
@@ -91,26 +81,6 @@ def test_the_example_runs(tmp_path, monkeypatch):
     assert tried.failed == 0
 
 
-def test_frames_that_cannot_be_made(tmp_path):
-    folder = Scene(frames=6).write(tmp_path / "in")
-    victim = folder / "shot.1006.exr"
-    victim.write_bytes(victim.read_bytes()[:-2000])
-    made = list(hybrid.denoise_shot(hybrid.open_shot(folder), tmp_path / "out", preset="draft", keep_going=True))
-    assert [frame.number for frame in made if isinstance(frame, Failed)] == [1006]
-    with pytest.raises(ValueError, match=r"shot\.1006\.exr"):
-        list(hybrid.denoise_shot(hybrid.open_shot(folder), tmp_path / "out", preset="draft"))
-
-
-def test_the_input_is_spared(shot_folder):
-    with pytest.raises(ValueError, match="overwrite"):
-        next(hybrid.denoise_shot(hybrid.open_shot(shot_folder), shot_folder, preset="draft"))
-
-
-def test_there_is_nothing_else():
-    with pytest.raises(AttributeError, match="no attribute 'denoise'"):
-        hybrid.denoise  # noqa: B018
-
-
 def states(folder, **options):
     """Whether each frame was there, by `denoise_shot` with resume."""
     return [frame.resumed for frame in hybrid.denoise_shot(hybrid.open_shot(folder), resume=True, **options)]
@@ -146,23 +116,6 @@ def test_the_command_and_the_api_continue_each_other(shot_folder, tmp_path, opti
     files = [{path.name: path.read_bytes() for path in out.glob("*.exr")} for out in (first, second)]
     assert files[0] == files[1]
     assert command(shot_folder, first, *words, "--no-stages", "gate") == [False] * 3
-
-
-@pytest.mark.neural
-def test_the_preset_is_that_which_was_asked_for(shot_folder, tmp_path):
-    pytest.importorskip("torch")
-    for preset in ("fast", "balanced"):
-        options = {"preset": preset, "first_pass": "nlm", "precision": "float32"}
-        assert len(
-            list(hybrid.denoise_shot(hybrid.open_shot(shot_folder, frames="1002"), tmp_path / preset, **options))
-        )
-        words = ["--preset", preset, "--first-pass", "nlm", "--precision", "float32", "--frames", "1002"]
-        assert main(["denoise", str(shot_folder), "-o", str(tmp_path / f"{preset} too"), *words]) == 0
-        same(tmp_path / preset, tmp_path / f"{preset} too")
-    made = [
-        read_exr(tmp_path / preset / "shot.1002.exr").channel("ViewLayer.Combined.R") for preset in ("fast", "balanced")
-    ]
-    assert not np.array_equal(*made)
 
 
 @pytest.mark.parametrize("passes", [1, pytest.param(2, marks=pytest.mark.neural)])

@@ -1,7 +1,5 @@
 """A shot rendered with Mitsuba 3: its AOV integrator's files need no option."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

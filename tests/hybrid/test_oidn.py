@@ -1,7 +1,5 @@
 """OIDN as we call it: right modes, checked input, clear errors."""
 
-from __future__ import annotations
-
 import json
 import sys
 from importlib.util import find_spec
@@ -21,10 +19,7 @@ from hybrid.records import read_records
 from tests.scenes import Scene
 
 Image = NDArray[np.float32]
-needs_oidn = [
-    pytest.mark.oidn,
-    pytest.mark.skipif(find_spec("pyoidn") is None, reason="pyoidn is not installed"),
-]
+needs_oidn = [pytest.mark.oidn, pytest.mark.skipif(find_spec("pyoidn") is None, reason="pyoidn is not installed")]
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """The passes that renderers write, by their names and with their arithmetic: each keeps its light."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -188,11 +188,6 @@ def test_without_albedo_there_is_no_demodulation(tmp_path):
     assert found["demodulate"].figure is None
 
 
-def test_one_frame_has_a_plan(tmp_path):
-    found = decisions(Scene(frames=1).write(tmp_path))
-    assert not found["warp"].on
-
-
 def test_the_user_may_force_what_was_measured(shot_folder):
     plan = plan_shot(open_shot(shot_folder), Rules(on=frozenset({"refine"}), off=frozenset({"warp"})))
     assert "refine" in plan.stages

@@ -1,7 +1,5 @@
 """The preset "gathered": samples meet along the motion, and are denoised once more."""
 
-from __future__ import annotations
-
 import importlib.util
 
 import numpy as np

@@ -5,7 +5,6 @@ import pytest
 
 from hybrid.comparison.metrics import psnr
 from hybrid.files.shots import open_shot
-from hybrid.plan import STAGES
 from hybrid.pseudo_reference import CLASSICAL_PRESETS, DRAFT, FINAL, STANDARD, filter_window
 from hybrid.stream import FrameStream
 from nlm.average import robust_average
@@ -51,27 +50,6 @@ def test_a_hole_in_the_sequence_is_a_narrower_window(tmp_path):
     assert window.confidence[3:].max() > 0.9
 
 
-def test_frames_are_read_once_while_the_window_slides(tmp_path, monkeypatch):
-    shot = open_shot(SCENE.write(tmp_path))
-    read = []
-    monkeypatch.setattr("hybrid.files.reader.read_exr", _counting(read))
-    aligner = FrameStream(shot, only(MOVING))
-    for number in shot.numbers:
-        aligner.align(number)
-    pixels = [path for path, whole in read if whole]
-    assert sorted(pixels) == sorted(set(pixels))
-
-
-def _counting(read):
-    from hybrid.files.exr import read_exr
-
-    def counted(path, *args, pixels=True, **options):
-        read.append((str(path), pixels))
-        return read_exr(path, *args, pixels=pixels, **options)
-
-    return counted
-
-
 def test_each_preset_beats_the_robust_average_and_final_the_noisy_frame_by_six_decibels(tmp_path):
     window = align(SCENE.write(tmp_path))
     truth = SCENE.clean(2)["ViewLayer.Combined"]
@@ -96,59 +74,6 @@ def test_draft_leaves_out_what_a_single_frame_shows(tmp_path):
     assert np.abs(haunted - plain)[inner].max() > 0
 
 
-@pytest.mark.parametrize("scale", [1e-4, 1e4])
-@pytest.mark.parametrize("preset", [DRAFT, STANDARD])
-def test_the_estimate_scales_with_the_radiance(tmp_path, scale, preset):
-    stages = MOVING | {"gate", "prefilter", "refine"}
-    plain = filter_window(align(SCENE.write(tmp_path / "plain"), stages), preset)
-    scaled = filter_window(align(SCENE.write(tmp_path / "scaled", scale=scale), stages), preset)
-    # float32 through two filters; the promise is 1e-3
-    np.testing.assert_allclose(scaled, scale * plain, rtol=1e-3, atol=1e-5 * scale)
-
-
-def test_nonfinite_pixels_are_counted_filled_and_stay_local(tmp_path):
-    def spoil(index, layers):
-        if index == 2:
-            layers["ViewLayer.Combined"][10, 12] = np.nan
-            layers["ViewLayer.Combined"][11, 12, 1] = np.inf
-            layers["ViewLayer.Denoising Albedo"][30, 5] = np.nan
-            layers["ViewLayer.Vector"][20, 20] = np.nan, 1e9, -1e9, np.inf
-
-    good = align(SCENE.write(tmp_path / "good"))
-    spoilt = align(SCENE.write(tmp_path / "spoilt", edit=spoil))
-    assert (good.centre.frame.repaired, spoilt.centre.frame.repaired) == (0, 3)
-    assert spoilt.confidence[2, 10, 12] == 0
-    image, plain = filter_window(spoilt, STANDARD), filter_window(good, STANDARD)
-    assert np.isfinite(image).all()
-    # Beyond search (2), patch (3), variance (2), outliers (1) and guided (1) radius of the spoilt pixels little can
-    # change: only the guided filter's and the gate's global scales.
-    far = np.ones(image.shape[:2], bool)
-    for y, x in ((10, 12), (30, 5), (20, 20)):
-        far[max(y - 12, 0) : y + 13, max(x - 12, 0) : x + 13] = False
-    np.testing.assert_allclose(image[far], plain[far], rtol=0.02)
-
-
-def test_a_firefly_leaves_neither_a_bright_spot_nor_a_dark_hole(tmp_path):
-    def burn(index, layers):
-        if index == 2:
-            layers["ViewLayer.Combined"][20, 28] = 1e6
-
-    image = filter_window(align(SCENE.write(tmp_path, edit=burn)), FINAL)
-    truth = SCENE.clean(2)["ViewLayer.Combined"]
-    ratio = image[18:23, 26:31].mean() / truth[18:23, 26:31].mean()
-    # The noise of 30 % averaged over five frames and some neighbours: a few per cent.
-    assert 0.9 < ratio < 1.1
-
-
-def test_a_still_shot_is_not_warped(tmp_path):
-    scene = Scene(frames=3, step=(0, 0))
-    aligner = FrameStream(open_shot(scene.write(tmp_path)), only({"demodulate"}))
-    window = aligner.align(scene.first + 1)
-    noisy = scene.noisy(0)["ViewLayer.Combined"]
-    np.testing.assert_allclose(window.color[1] * window.modulation, noisy, rtol=1e-5)
-    assert (aligner.flow(scene.first + 1, scene.first)[0] == 0).all()
-
-
 def test_without_vectors_the_motion_is_found(tmp_path):
     scene = Scene(height=64, width=96, noise=0.05)
     folder = scene.write(tmp_path, without={"Vector"})
@@ -168,7 +93,3 @@ def test_aovs_travel_along_and_sum_to_the_beauty(tmp_path):
     shot = open_shot(SCENE.write(tmp_path, edit=split), aovs=("direct", "indirect"))
     window = FrameStream(shot, only({"warp"})).align(MIDDLE)
     np.testing.assert_allclose(window.aovs["direct"] + window.aovs["indirect"], window.color, rtol=1e-5)
-
-
-def test_every_effect_is_known_to_the_plan():
-    assert STAGES.keys() >= MOVING | {"gate", "prefilter", "refine", "dense-flow"}

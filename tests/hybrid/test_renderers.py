@@ -1,7 +1,5 @@
 """Files of any renderer: one shot, rewritten as each would have written it, gives one picture."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 from collections.abc import Callable

@@ -319,6 +319,12 @@ def test_detail_that_the_neighbours_lack_stays(tmp_path):
     assert inside[1::2].mean() == pytest.approx(1.2, abs=0.01)
 
 
+@pytest.fixture(scope="module")
+def restored(tmp_path_factory):
+    """The mean with the stages that restore it."""
+    return TestMean().mean_of(tmp_path_factory.mktemp("restored"))
+
+
 class TestMean:
     """Light that denoisers lose comes back, fireflies included, and no single sample is spread."""
 
@@ -330,10 +336,10 @@ class TestMean:
         maker = pictures(shot, lambda a: Denoised(np.float32(0.97) * truth(self.SCENE, a.number)), rules or Rules())
         return float(maker.make(self.NUMBER).denoised.color.mean() / truth(self.SCENE, self.NUMBER).mean())
 
-    def test_what_a_denoiser_loses_comes_back(self, tmp_path):
+    def test_what_a_denoiser_loses_comes_back(self, tmp_path, restored):
         assert self.mean_of(tmp_path / "off", rules=STEADY) == pytest.approx(0.97, abs=1e-4)
         # 32 000 pixels with a deviation of a half: the mean is known to 0.3 %.
-        assert self.mean_of(tmp_path / "on") == pytest.approx(1, abs=0.005)
+        assert restored == pytest.approx(1, abs=0.005)
 
     def test_fireflies_belong_to_it(self, tmp_path):
         """Twenty pixels of each frame, others in each, shine, and are taken out. Held to the limit, they are 2.5 %."""
@@ -356,13 +362,12 @@ class TestMean:
         # tell it, which is hardly.
         assert self.mean_of(tmp_path / "out", shine) == pytest.approx(1, abs=0.007)
 
-    def test_one_bright_sample_is_not_spread(self, tmp_path):
+    def test_one_bright_sample_is_not_spread(self, tmp_path, restored):
         def burn(index, layers):
             if index == 1:
                 layers["ViewLayer.Combined"][80, 100] = 1e5
 
-        whole, burnt = self.mean_of(tmp_path / "whole"), self.mean_of(tmp_path / "burnt", burn)
-        assert burnt == pytest.approx(whole, abs=1e-3)
+        assert self.mean_of(tmp_path, burn) == pytest.approx(restored, abs=1e-3)
 
 
 @pytest.mark.parametrize("gray", [False, True])
@@ -491,7 +496,7 @@ class TestSamples:
         off = made(shot, self.blurred, rules=Rules(off=frozenset({"blend-samples"})))
         assert np.abs(off[inside] / wanted[inside] - 1).max() > 0.1
 
-    @pytest.mark.parametrize("noise", [1.0, 0.3, 0.1, 0.03, 0.01, 0.003])
+    @pytest.mark.parametrize("noise", [1.0, 0.1, 0.003])
     def test_a_bad_denoiser_does_no_harm_at_any_level_of_noise(self, tmp_path, noise):
         scene = replace(STILL, noise=noise)
         shot = open_shot(scene.write(tmp_path))
@@ -555,8 +560,11 @@ class TestSamples:
         # The light of the flakes, 3 % of the frame's, went into the mean of all other pixels too.
         assert result[elsewhere].mean() == pytest.approx(truth(scene, number)[elsewhere].mean(), rel=0.005)
 
-    @pytest.mark.parametrize("place", [0, 2], ids=["first", "middle"])
-    @pytest.mark.parametrize("rules", [Rules(), Rules(off=frozenset({"stabilize"}))], ids=["network", "classical"])
+    @pytest.mark.parametrize(
+        ("rules", "place"),
+        [(Rules(), 0), (Rules(off=frozenset({"stabilize"})), 2)],
+        ids=["network, first frame", "classical, middle"],
+    )
     def test_rain_that_a_denoiser_keeps_is_no_noise(self, tmp_path, rules, place):
         """Streaks that the picture shows: what each frame alone shows was taken for noise, and its detail was lost."""
         drops = np.random.default_rng(5).integers(0, (96, 160), (60, 2))

@@ -1,7 +1,5 @@
 """Frames of a stream: read once, without fireflies, and dropped."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -18,6 +18,7 @@ from hybrid.records import read_records
 from hybrid.stabilize import Denoised
 from hybrid.stream import FrameStream, plan_shot
 from tests.scenes import Scene, denoise_view
+from tests.seldom import seldom
 
 # Locked off: what is odd is odd by itself. Frame numbers 1001 to 1012; the odd one is 1009.
 CALM = Scene(frames=12, step=(0, 0), height=48, width=64)
@@ -62,7 +63,7 @@ def picture(shot, number, rules, first_pass=None):
 def test_every_frame_is_as_good_as_with_everything_on(tmp_path, change, given):
     shot = open_shot(CALM.write(tmp_path, edit=change))
     estimates = PerFrame(lambda frame: frame.color) if given else None
-    for number in range(1006, 1013):
+    for number in (1007, 1009, 1011):
         planned = picture(shot, number, Rules(), estimates)
         forced = picture(shot, number, FORCED, estimates)
         assert planned.mean() == pytest.approx(forced.mean(), rel=0.01), number
@@ -90,7 +91,7 @@ def test_the_plan_says_on_which_frames_a_stage_runs(tmp_path):
     assert found["fireflies"].frames == tuple(range(1007, 1012))
 
 
-@pytest.mark.parametrize("change", [brighter, moving, burnt])
+@pytest.mark.parametrize("change", [brighter, *seldom(moving, burnt)])
 def test_a_frame_is_the_same_whatever_part_of_the_shot_is_asked_for(tmp_path, change):
     folder = CALM.write(tmp_path / "in", edit=change)
 
@@ -128,18 +129,6 @@ def test_a_file_is_read_once_for_the_plan_and_the_work_and_once_to_be_written_ov
         pass
     assert len(read) == 16
     assert {read.count(name) for name in read} == {2}
-
-
-def test_a_lamp_of_one_pixel_that_is_there_in_every_frame_stays(tmp_path):
-    def lamp(index, layers):
-        layers["ViewLayer.Combined"][20, 30] = 500
-
-    shot = open_shot(CALM.write(tmp_path, edit=lamp))
-    aligner = FrameStream(shot, Rules())
-    assert aligner.align(1006).centre.frame.fireflies == 0
-    frame = aligner.frame(1006)
-    assert frame.with_highlights[20, 30].mean() == pytest.approx(500, rel=2e-3)
-    assert frame.with_highlights.sum() == pytest.approx(shot.read(1006).color.sum(), rel=2e-3)
 
 
 @pytest.mark.parametrize("step", [(0, 0), (2, 1)])
@@ -200,7 +189,7 @@ def test_the_mean_of_a_shot_with_and_without_fireflies_is_on_record(tmp_path):
     assert record["mean"]["without"] == pytest.approx(kept, rel=0.01)
 
 
-@pytest.mark.parametrize("samples", [16, 256, 4096])
+@pytest.mark.parametrize("samples", [16, 4096, *seldom(256)])
 @pytest.mark.parametrize("step", [(0, 0), (3, 1)])
 @pytest.mark.parametrize("fixed", [False, True])
 @pytest.mark.parametrize("vectors", [True, False])
@@ -306,7 +295,7 @@ def flow_of(shot, rules):
     return aligner.flow(1002, 1003)
 
 
-@pytest.mark.parametrize("factor", [1.0, 1.18, 0.84])
+@pytest.mark.parametrize("factor", [1.0, 1.18, *seldom(0.84)])
 @pytest.mark.parametrize("step", [(0, 0), (2, 1)])
 def test_another_exposure_shows_through_noise_that_hides_it_in_small_areas(tmp_path, factor, step):
     """9×9 pixels of a noisy frame did not tell 18 % of light: two frames before it came out 2 % too bright."""

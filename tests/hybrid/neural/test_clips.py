@@ -2,8 +2,6 @@
 
 # ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -58,50 +58,8 @@ def test_tiles_give_what_the_whole_image_gives(tmp_path, weights):
     # The receptive field of the U-Net is wider than the halo; what lies beyond has next to no influence: 4e-7 here.
     np.testing.assert_allclose(denoiser(window).color, whole, rtol=0, atol=1e-5 * whole.mean())
     assert np.abs(whole - window.color[2] * window.modulation).max() > 0.1  # it does something
-
-
-def test_tiles_show_their_seams_without_a_halo(tmp_path, weights):
-    """So the test above sees what it is for."""
-    scene = Scene(height=40, width=420, frames=5)
-    window = FrameStream(open_shot(scene.write(tmp_path)), only(STAGES), first_pass=Classical(DRAFT)).align(
-        scene.first + 2
-    )
-    whole = open_network(weights, tile=512, precision="float32")(window).color
-    denoiser = open_network(weights, tile=32, precision="float32")
     denoiser.halo = 0
-    tiled = denoiser(window).color
-    assert np.abs(tiled - whole).max() > 0.1 * whole.mean()  # measured: a sixth and a third
-
-
-def test_bfloat16_is_close_to_float32(folder, weights):
-    window = align(folder)
-    exact = open_network(weights, precision="float32")(window).color
-    short = open_network(weights, precision="bfloat16")(window).color
-    # Features have 8 bits; the kernels that come of them are applied in float32.
-    assert np.sqrt(np.mean((short - exact) ** 2)) < 0.02 * exact.mean()
-
-
-@pytest.mark.parametrize("scale", [1e-4, 1e4])
-def test_the_result_scales_with_the_radiance(tmp_path, folder, weights, scale):
-    denoiser = open_network(weights, precision="float32")
-    plain = denoiser(align(folder)).color
-    scaled = denoiser(align(SCENE.write(tmp_path, scale=scale))).color
-    np.testing.assert_allclose(scaled, scale * plain, rtol=1e-3, atol=1e-4 * scale)
-
-
-def test_a_flat_picture_stays_as_it_is(tmp_path, weights):
-    def flatten(index, layers):
-        layers["ViewLayer.Combined"][:] = 0.7
-        layers["ViewLayer.Denoising Albedo"][:] = 0.5
-
-    image = open_network(weights, precision="float32")(align(SCENE.write(tmp_path, edit=flatten))).color
-    # Kernels sum to 1. A trunk was 0.4 % off at most; 28 % at the borders, before they were mirrored.
-    np.testing.assert_allclose(image, 0.7, rtol=1e-5 if weights.stem == "untrained" else 0.01)
-
-
-def test_without_guides_it_runs(tmp_path, weights):
-    scene = SCENE.write(tmp_path, without={"Denoising Albedo", "Denoising Normal", "Depth"})
-    assert np.isfinite(open_network(weights)(align(scene)).color).all()
+    assert np.abs(denoiser(window).color - whole).max() > 0.1 * whole.mean()  # seams; measured: a sixth and a third
 
 
 def test_aovs_are_filtered_with_the_same_kernels(tmp_path, weights):

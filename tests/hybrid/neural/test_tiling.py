@@ -1,7 +1,5 @@
 """Pictures, tensors and tiles."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

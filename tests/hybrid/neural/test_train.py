@@ -74,8 +74,7 @@ def test_a_training_reuses_freed_memory(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("init", "asked", "used"),
-    [(None, None, "input"), ("balanced", None, "start"), ("fast", "input", "input")],
+    ("init", "asked", "used"), [(None, None, "input"), ("balanced", None, "start"), ("fast", "input", "input")]
 )
 def test_losses_are_over_those_at_the_start_where_weights_are_given(init, asked, used, monkeypatch, tmp_path):
     given = []

@@ -1,7 +1,5 @@
 """The first run: loops are compiled by several processes, each once, and later runs find all."""
 
-from __future__ import annotations
-
 import gc
 import json
 import os
@@ -66,6 +64,7 @@ sys.exit(code)
 """
 
 
+@pytest.mark.reliability
 def test_a_second_run_compiles_nothing_while_helpers_of_the_first_still_work(shot_folder, tmp_path):
     env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "NUMBA_NUM_THREADS": "2"}
     words = [sys.executable, "-c", COUNT, "denoise", str(shot_folder), "-o", str(tmp_path / "out"), "--preset", "draft"]

@@ -1,7 +1,5 @@
 """Arrays that outlive a window: in files, the same values, and gone with their last reference."""
 
-from __future__ import annotations
-
 import gc
 import mmap
 import sys

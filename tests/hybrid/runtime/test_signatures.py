@@ -1,7 +1,5 @@
 """Signatures: the list is that of the loops which a run calls, and each type is read as it was written."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

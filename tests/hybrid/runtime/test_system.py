@@ -16,7 +16,6 @@ from hybrid.runtime.system import (
     load_average,
     lock_file,
     open_file,
-    peak_memory,
     process_lives,
     processor_name,
     replace_path,
@@ -150,14 +149,6 @@ def test_a_process_is_asked_about_without_a_signal():
         assert child.returncode == 0
     assert not process_lives(child.pid)
     assert process_lives(os.getpid())
-
-
-def test_peak_memory_holds_what_the_process_takes():
-    before = peak_memory()
-    held = bytearray(os.urandom(1)) * 2**26
-    assert peak_memory() > 2**22  # bytes, and not KiB or pages: an interpreter alone takes more
-    assert peak_memory() >= before
-    assert len(held) == 2**26
 
 
 @pytest.mark.parametrize("platform", [sys.platform, "win32"])
