@@ -103,9 +103,9 @@ def _bilinear(
     flat, result = image.reshape(-1), out.reshape(-1)
     column, row = np.uintp(channels), np.uintp(width * channels)
     for y in range(first, last):
-        inside[y], x0, y0, all_fx, all_fy = locate_row(flow, y, corner, width, height, count)
+        near, x0, y0, all_fx, all_fy = locate_row(flow, y, corner, width, height, count)
         for x in range(count):
-            fx, fy = all_fx[x], all_fy[x]
+            inside[y, x], fx, fy = near[x], all_fx[x], all_fy[x]
             weights = (one - fy) * (one - fx), (one - fy) * fx, fy * (one - fx), fy * fx
             start = np.uintp(y0[x]) * row + np.uintp(x0[x]) * column
             right, down = column if fx > zero else np.uintp(0), row if fy > zero else np.uintp(0)
@@ -189,8 +189,9 @@ def _bicubic(
     column, row = np.uintp(channels), np.uintp(width * channels)
     count = out.shape[1]
     for y in range(first, last):
-        inside[y], all_x0, all_y0, all_fx, all_fy = locate_row(flow, y, corner, width, height, count)
+        near, all_x0, all_y0, all_fx, all_fy = locate_row(flow, y, corner, width, height, count)
         for x in range(count):
+            inside[y, x] = near[x]
             x0, y0, fx, fy = int(all_x0[x]), int(all_y0[x]), all_fx[x], all_fy[x]
             x1, y1 = x0 + 1 if fx > 0 else x0, y0 + 1 if fy > 0 else y0
             # A fraction of 0 has the weights (0, 1, 0, 0): read the one sample that counts.

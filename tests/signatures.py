@@ -17,13 +17,15 @@ from hybrid.runtime.threads import prepare_libraries
 prepare_libraries()
 from hybrid.cli import main
 from hybrid.runtime.signatures import describe_type
+from numba.core.caching import NullCache
 from numba.core.dispatcher import Dispatcher
 
 code = main(sys.argv[2:])
 for name, module in sorted(sys.modules.items()):
     if name.startswith(tuple(sys.argv[1].split())):
         for attribute, loop in sorted(vars(module).items()):
-            if isinstance(loop, Dispatcher) and loop.__module__ == name:
+            # Loops without a cache are compiled within others.
+            if isinstance(loop, Dispatcher) and loop.__module__ == name and not isinstance(loop._cache, NullCache):
                 for signature in loop.signatures:
                     print(json.dumps([f"{name}.{attribute}", [describe_type(one) for one in signature]]))
 sys.exit(code)

@@ -15,12 +15,13 @@ from typing import Any
 from numba.core import event
 
 from hybrid.runtime.compiled import is_compiled_elsewhere
-from hybrid.runtime.signatures import listed_loops
+from hybrid.runtime.signatures import count_listed, listed_loops
 from loops.parallel import thread_count
 
 LOG = logging.getLogger("ravg")
 
 MOST = 6  # helpers: the longest loop takes a seventh of the time of all
+SECONDS = 45  # CPU time in which one core of a Zen 3 compiles all loops of `balanced`
 
 
 class FirstRun(event.Listener):
@@ -39,7 +40,10 @@ class FirstRun(event.Listener):
         if self.begun:
             return
         self.begun = True
-        LOG.info("compiling for this processor, in the first run only: ten seconds to a minute")
+        seconds = -(-SECONDS // min(thread_count(), MOST + 1))
+        LOG.info(
+            f"compiling for this processor, in the first run only: up to {count_listed()} loops, about {seconds} s"
+        )
         folder = getattr(event.data["dispatcher"]._cache, "cache_path", None)  # None without a cache
         if folder and not folder.startswith(os.devnull):
             _start_helpers()

@@ -25,6 +25,11 @@ def listed_loops() -> Iterator[tuple[Any, tuple[Any, ...]]]:
         yield _find(name), tuple(parse_type(argument) for argument in arguments)
 
 
+def count_listed() -> int:
+    """Return the number of loops in `signatures.json`."""
+    return len(json.loads(FILE.read_text(encoding="utf-8")))
+
+
 def describe_type(type_: Any) -> Any:
     """Return a numba type as JSON.
 
