@@ -171,7 +171,8 @@ def _why_untried(document: Mapping[str, Any]) -> str:
     if document["state"] == "running":
         return f"the process of the run is gone ({document['process']} on {document['host']})"
     if "error" in document:
-        return f"the run ended: {document['error']}"
+        last = [n for n, entry in document["frames"].items() if entry.get("error") == document["error"]]
+        return f"the run ended at frame {last[-1]}" if last else f"the run ended: {document['error']}"
     return "the run was stopped" if document["state"] == "stopped" else ""
 
 

@@ -89,6 +89,8 @@ class ChunkLog:
         if fault:
             self._failed.append(name)
             for message in self._errors[name]:
+                if fault.endswith(f": {message}"):
+                    return
                 fault = fault.replace(f": {message}", "")
             LOG.error(f"{name}: {fault}")
         else:
@@ -97,7 +99,7 @@ class ChunkLog:
     def finish(self) -> None:
         """Raise typer.Exit with 1 if a chunk has failed."""
         if self._failed:
-            LOG.error(f"{len(self._failed)} of {len(self._chunks)} chunks were not made: {', '.join(self._failed)}")
+            LOG.error(f"{len(self._failed)} of {len(self._chunks)} chunks failed: {', '.join(self._failed)}")
             raise typer.Exit(1)
 
 

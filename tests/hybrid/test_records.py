@@ -240,7 +240,7 @@ def test_sequences_of_one_folder_are_named_and_counted_apart(shot_folder, tmp_pa
     assert left.startswith("left")
     assert "finished: 3 of 3 frames, 1001-1003" in left
     assert "failed: 1 of 3 frames, 1001" in right
-    assert "not tried: 2 of 3 frames, 1002-1003: the run ended: " in right
+    assert "not tried: 2 of 3 frames, 1002-1003: the run ended at frame 1001\n" in right
     assert run(capsys, "status", out / "other.####.exr")[2].endswith(
         "no records of other, expected one of left, right\n"
     )

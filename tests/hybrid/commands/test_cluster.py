@@ -175,7 +175,7 @@ def test_a_chunk_that_cannot_be_made_is_told(cluster, tmp_path, capsys):
     assert main(words) == 1
     err = capsys.readouterr().err
     assert "shot.1008.exr" in err
-    assert err.splitlines()[-1] == "error: 1 of 2 chunks were not made: 1005-1008"
+    assert err.splitlines()[-1] == "error: 1 of 2 chunks failed: 1005-1008"
     assert {f"shot.{number}.exr" for number in range(1001, 1005)} <= contents(out).keys()
 
 
