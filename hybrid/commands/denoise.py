@@ -150,7 +150,7 @@ def _denoise_in_chunks(
     start = time.monotonic()
     shot = request.shot.open()
     check_paths(shot, request.output, request.options, paths=request.paths)
-    _summarize_shot(request, shot)
+    _summarize_shot(request, shot.views[0])
     first = output_path(request.output, shot, shot.numbers[0])
     folder, name = first.parent, sequence_name(first)
     before = {path: record["started"] for path, record in read_records(folder, name)}
