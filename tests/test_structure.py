@@ -115,7 +115,6 @@ WITHOUT_TESTS_OF_THEIR_OWN = {
     "hybrid/commands/simulate.py",
     "hybrid/commands/status.py",
     "hybrid/memory.py",
-    "hybrid/simulate/fixed_shots.py",
     "hybrid/simulate/motion.py",
     "hybrid/simulate/random_assets.py",
     "hybrid/simulate/scene_assets.py",

@@ -12,7 +12,7 @@ from hybrid.commands.log import LOG, Progress
 from hybrid.commands.options import command, usage
 from hybrid.simulate.run import parse_center, parse_size, read_meta, samples_left, shots_of
 from hybrid.simulate.run import simulate as render
-from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings, parse_levels, parse_samples
+from hybrid.simulate.shot import RANDOM, ShotSettings, parse_levels, parse_samples
 
 
 @command("simulate", ShotSettings)
@@ -38,9 +38,8 @@ def simulate(
     """Render the shots, here or on a cluster."""
     from hybrid.files.sequences import parse_frames
 
-    known = [*RANDOM, *FIXED, *(f"{kind}:{name}" for kind, names in FIXED.items() for name in names)]
-    if scene not in known and not Path(scene).is_file():
-        raise FileNotFoundError(f"scene: no file {scene}; expected a .blend file or one of {', '.join(known)}")
+    if scene not in RANDOM and not Path(scene).is_file():
+        raise FileNotFoundError(f"scene: no file {scene}; expected a .blend file, {' or '.join(RANDOM)}")
 
     def settings(scene: str, seed: int) -> ShotSettings:
         return ShotSettings(

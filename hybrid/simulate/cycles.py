@@ -24,7 +24,7 @@ import OpenEXR
 
 from hybrid.simulate import scenes
 from hybrid.simulate.effects import EVERYTHING, PASSES, effects_of, facts_of, needed_bounces, settings_of
-from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings, frame_seed
+from hybrid.simulate.shot import RANDOM, ShotSettings, frame_seed
 
 ATTEMPTS = 8  # random shots of one seed that are tried
 PILOT_SAMPLES = 8
@@ -125,12 +125,7 @@ def pilot(scene: Any, frames: list[int], settings: dict[str, Any], seed: int) ->
 
 def build(shot: ShotSettings, attempt: int, threads: int) -> dict[str, Any]:
     """Make the scene of a shot, ready to be planned; return its description. `attempt` counts shots of a seed."""
-    if shot.scene in RANDOM:
-        description = scenes.random_shot(shot, attempt)
-    elif shot.scene.partition(":")[0] in FIXED:
-        description = scenes.fixed_shot(shot)
-    else:
-        description = scenes.file_shot(shot)
+    description = scenes.random_shot(shot, attempt) if shot.scene in RANDOM else scenes.file_shot(shot)
     settings = EVERYTHING if shot.effects == "all" else {**EVERYTHING, **dict.fromkeys(PASSES, False)}
     configure(bpy.context.scene, settings, threads)
     bpy.context.scene.render.use_persistent_data = not shot.motion_blur

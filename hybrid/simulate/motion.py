@@ -10,7 +10,7 @@ from mathutils import Euler, Matrix, Quaternion, Vector
 
 from hybrid.simulate.effects import film_pixel, visible_points
 from hybrid.simulate.random_assets import add_asset, log_uniform, material, warm, weighted_choice
-from hybrid.simulate.scene_assets import Point, Rng, add_lamp, add_object
+from hybrid.simulate.scene_assets import Rng, add_lamp, add_object
 from hybrid.simulate.shot import ShotSettings
 
 
@@ -75,14 +75,6 @@ def place_camera(rng: Rng, focus: Vector, eye: Vector) -> Any:
     roll = Quaternion((0, 0, 1), float(rng.normal(0, 0.02)))
     camera.rotation_euler = ((focus - eye).to_track_quat("-Z", "Y") @ roll).to_euler()
     bpy.context.view_layer.update()
-    return camera
-
-
-def aim_camera(eye: Point, focus: Point, lens: float) -> Any:
-    """Place the scene's camera at `eye`, aimed at `focus`, with a focal length in millimetres; return the camera."""
-    camera = bpy.context.scene.camera
-    camera.data.lens, camera.location = lens, eye
-    camera.rotation_euler = (Vector(focus) - Vector(eye)).to_track_quat("-Z", "Y").to_euler()
     return camera
 
 
@@ -231,21 +223,6 @@ def move_object(rng: Rng, shot: ShotSettings, item: Any, kind: str | None = None
         key(bend, "value", *span, lambda t: math.sin(rate * t))
     scene.frame_set(shot.middle)
     return {"object": item.name, "motion": kind, "pixels": round(pixels, 2)}
-
-
-def key_motion(item: Any, frames: range, velocity: Point = (0, 0, 0), spin: Point = (0, 0, 0)) -> None:
-    """Key steady motion, in metres and radians per frame, through the current pose in the middle of `frames`."""
-    location, turn, middle = Vector(item.location), Vector(item.rotation_euler), frames[len(frames) // 2]
-    key(item, "location", frames, middle, lambda t: location + Vector(velocity) * t)
-    key(item, "rotation_euler", frames, middle, lambda t: turn + Vector(spin) * t)
-
-
-def key_swing(item: Any, frames: range, axis: str, amplitude: float, rate: float, phase: float = 0.0) -> None:
-    """Key a pendulum's turn around its origin: `amplitude` radians to each side, `rate` radians of phase per frame."""
-    rest, middle = getattr(item.rotation_euler, axis), frames[len(frames) // 2]
-    for frame in frames:
-        setattr(item.rotation_euler, axis, rest + amplitude * math.sin(phase + rate * (frame - middle)))
-        item.keyframe_insert("rotation_euler", frame=frame)
 
 
 # Lights, and all of it

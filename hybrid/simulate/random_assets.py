@@ -13,7 +13,7 @@ from mathutils import Vector
 
 from hybrid.simulate import scene_assets as assets
 
-# Blender's other two environment images, courtyard and night, are reserved for the test shots.
+# Blender's other two environment images, courtyard and night, light the scenes to judge on in examples/scenes.
 SKIES = ("city", "forest", "interior", "studio", "sunrise", "sunset")
 
 
@@ -91,16 +91,6 @@ def _new_image(name: str, pixels: np.ndarray, linear: bool = False) -> Any:
     image.pixels.foreach_set(pixels.astype(np.float32).ravel())
     image.update()
     return image
-
-
-def printed(rng: assets.Rng) -> Any:
-    """Make a material of a painted image: labels, spines, pictures."""
-    made = assets.plain("printed", (1, 1, 1), Roughness=0.6)
-    tree = made.node_tree
-    image = assets.node(tree, "TexImage", Vector=assets.node(tree, "TexCoord").outputs["Generated"])
-    image.image, image.projection = painted_image(rng), "BOX"
-    tree.links.new(image.outputs["Color"], tree.nodes["Principled BSDF"].inputs["Base Color"])
-    return made
 
 
 def texture(rng: assets.Rng, tree: Any, coordinates: Any, scale: float) -> tuple[Any, Any]:

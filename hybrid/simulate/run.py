@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from hybrid.files.replace import write_file
-from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings
+from hybrid.simulate.shot import RANDOM, ShotSettings
 
 NO_BLENDER = (
     'Blender\'s Python module (bpy) is not installed in {python}: `pip install "bpy==5.0.1"` with Python 3.11, '
@@ -191,15 +191,8 @@ def shots_of(
 ) -> list[tuple[ShotSettings, Path]]:
     """Return `count` shots, made by `settings(scene, seed)` with seeds that count up, and their folders.
 
-    One shot goes into `out` itself, several into `out/SCENE_SEED`; those of `validation` and `test` into `out/NAME`.
+    One shot goes into `out` itself, several into `out/SCENE_SEED`.
     """
-    kind, _, name = scene.partition(":")
-    if kind in FIXED:
-        if count > 1:
-            raise ValueError(f"shots: got {count}, expected 1, as the {kind} shots are fixed")
-        if name:
-            return [(settings(scene, first_seed), out)]
-        return [(settings(f"{kind}:{name}", first_seed), out / name) for name in FIXED[kind]]
     seeds = range(first_seed, first_seed + count)
     return [(settings(scene, seed), out if count == 1 else out / f"{Path(scene).stem}_{seed:04d}") for seed in seeds]
 

@@ -1,4 +1,4 @@
-"""Random shots, fixed shots, and shots of scenes from files. All random numbers come from the seed of the shot.
+"""Random shots, and shots of scenes from files. All random numbers come from the seed of the shot.
 
 A random shot is a *set* (room, studio, outdoors, night, wall), objects in it, lights, a camera on a path, and a crop
 of its film-size image. Lengths are metres, z is up. Brightness is left to `exposure`.
@@ -15,8 +15,7 @@ from mathutils import Vector
 
 from hybrid.simulate import scene_assets as assets
 from hybrid.simulate.effects import visible_points
-from hybrid.simulate.fixed_shots import FIXED_SHOTS
-from hybrid.simulate.motion import add_floating, add_motion, frame_crop, move_object, place_camera, set_crop
+from hybrid.simulate.motion import add_floating, add_motion, frame_crop, move_object, place_camera
 from hybrid.simulate.random_assets import (
     add_bulb_sphere,
     clutter,
@@ -386,23 +385,6 @@ def light_by_bulbs(rng: assets.Rng) -> None:
             assets.add_lamp("POINT", where, log_uniform(rng, 1, 12) * distance**2, radius, eye, warm(rng))
         else:
             add_bulb_sphere(radius, where, shades[number // 2 % 3])
-
-
-def fixed_shot(shot: ShotSettings) -> dict[str, Any]:
-    """Build the shot `KIND:NAME`, the same for every seed; return its description."""
-    kind, _, name = shot.scene.partition(":")
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    scene = bpy.context.scene
-    scene.frame_start, scene.frame_end = shot.keyed[0], shot.keyed[-1]
-    film, center = shot.film or shot.size, shot.center or (0.5, 0.5)
-    scene.render.resolution_x, scene.render.resolution_y = film
-    scene.camera = assets.add_object("camera", bpy.data.cameras.new("camera"))
-    # Not `shot.keyed`: Blender's frame_start is never below 0, and the shots are built around the middle of this range.
-    frames = range(scene.frame_start, scene.frame_end + 1)
-    FIXED_SHOTS[kind][name](np.random.default_rng(7), frames)  # the shot's seed is that of the samples alone
-    set_crop(scene.render, film, shot.size, center)
-    scene.frame_set(shot.middle)
-    return {kind: name, "film": list(film), "center": list(center)}
 
 
 def file_shot(shot: ShotSettings) -> dict[str, Any]:

@@ -8,11 +8,6 @@ from dataclasses import dataclass
 from typing import Any, Literal, Self
 
 RANDOM = ("random", "hard")  # shots drawn from the seed; the second kind holds what is hard to denoise
-# Fixed shots by kind: to validate with, and to test on.
-FIXED = {
-    "validation": ("table", "night", "garden"),
-    "test": ("lens", "closeup", "lamps", "shadow", "volume"),
-}
 MARGIN = 4  # frames keyed before and after the shot, so that vectors are valid on its first and last frame
 
 
@@ -24,7 +19,7 @@ class ShotSettings:
     may be None: drawn from the seed for random shots, else the whole image of the scene's own camera.
     """
 
-    scene: str  # a .blend file, one of RANDOM, or "KIND:NAME", a fixed shot
+    scene: str  # a .blend file, or one of RANDOM
     seed: int
     frames: tuple[int, ...]
     size: tuple[int, int]

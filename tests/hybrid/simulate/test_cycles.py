@@ -11,12 +11,13 @@ import OpenEXR
 import pytest
 
 from hybrid.simulate.run import simulate
-from hybrid.simulate.shot import FIXED, RANDOM, ShotSettings
+from hybrid.simulate.shot import RANDOM, ShotSettings
 
 pytestmark = pytest.mark.cycles
 pytest.importorskip("bpy", reason="renders with Cycles: pip install bpy==5.0.1")
 
 SIZE = (64, 36)
+SCENES = Path(__file__).parents[3] / "examples" / "scenes"
 
 # A textured floor and wall, a cube that moves 3 px a frame to the right, one lamp, no glossy or glass anything.
 SCENE = """
@@ -249,8 +250,8 @@ def errors_of_vectors(scene, channels):
     "name",
     [
         "random:3003 room, pan", "random:3007 studio, dolly", "random:23 outdoor, pan", "random:3008 night, pan",
-        "random:31 wall, pan", "hard:4203 glass and metal", "validation:table", "validation:night", "validation:garden",
-        "test:closeup", "test:lamps", "test:shadow", "test:volume", "file",
+        "random:31 wall, pan", "hard:4203 glass and metal", "table.blend", "night.blend", "garden.blend",
+        "closeup.blend", "lamps.blend", "shadow.blend", "volume.blend", "file",
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("blur", [False, True])
@@ -261,9 +262,12 @@ def test_vectors_follow_what_moves_in_every_kind_of_scene(name, blur, scene, tmp
     from hybrid.simulate import cycles
 
     kind, _, rest = name.partition(":")
-    where = {"random": kind, "hard": kind, "file": str(scene)}.get(kind, name)
+    where = {"random": kind, "hard": kind, "file": str(scene)}.get(kind, str(SCENES / name))
     seed = int(rest.split()[0]) if kind in RANDOM else 1
-    shot = ShotSettings(where, seed, (4, 5), SIZE, {"n": 4}, film=(1920, 1080), motion_blur=blur, motion="auto")
+    shot = ShotSettings(
+        where, seed, (4, 5), SIZE, {"n": 4}, film=(1920, 1080), motion_blur=blur,
+        center=(0.5, 0.5) if name.endswith(".blend") else None,
+    )  # fmt: skip
     cycles.build(shot, 0, 2)
     cycles.apply(bpy.context.scene, {"render.use_motion_blur": blur, "cycles.max_bounces": 1})
     bpy.context.scene.frame_set(4)
@@ -321,7 +325,7 @@ def test_what_blender_keeps_between_frames_changes_no_picture(tmp_path):
 
     from hybrid.simulate import cycles
 
-    shot = ShotSettings("validation:garden", 1, (1, 4), SIZE, {"n": 2})
+    shot = ShotSettings(str(SCENES / "garden.blend"), 1, (1, 4), SIZE, {"n": 2})
     pictures = []
     for keep in (True, False):
         cycles.build(shot, 0, 2)
@@ -355,20 +359,27 @@ def test_what_is_left_out_does_not_change_the_picture(scene, rendered, tmp_path)
     assert lean.mean() == pytest.approx(full.mean(), rel=0.005)
 
 
-def test_the_validation_shots_together_hold_every_effect(tmp_path):
+def test_the_scenes_of_the_examples_move_and_hold_every_effect(tmp_path):
     """Small and without a pilot: which rules switch what on is a question to the scenes alone."""
-    facts = []
-    for name in FIXED["validation"]:
-        shot = ShotSettings(f"validation:{name}", 1, (1, 2), SIZE, {"noisy": 1}, motion_blur=True, effects="all")
-        simulate([(shot, tmp_path / name)], threads=2)
-        facts.append(json.loads((tmp_path / name / "meta.json").read_text())["plan"]["facts"])
-        assert layer(read(tmp_path / name / "noisy.0002.exr"), "Combined").mean() > 0.01
+    found = {}
+    for path in sorted(SCENES.glob("*.blend")):
+        out = tmp_path / path.stem
+        shot = ShotSettings(str(path), 1, (1, 2), SIZE, {"noisy": 2}, film=(384, 216), center=(0.5, 0.5), effects="all")
+        simulate([(shot, out)], threads=2)
+        plan = json.loads((out / "meta.json").read_text())["plan"]
+        assert "motion" not in plan["description"], "a scene that moves gets no other motion"
+        color = layer(read(out / "noisy.0002.exr"), "Combined")
+        assert np.isfinite(color).all(), path.stem
+        assert 0.02 < color.mean() < 2, path.stem
+        assert color.std() > 0.3 * color.mean(), path.stem
+        found[path.stem] = plan["facts"]
+    facts = found.values()
     kinds = ("glossy", "mirrors", "transmissive", "transparent", "subsurface", "volumes", "hair", "small_lights")
-    assert all(any(fact[kind] for fact in facts) for kind in kinds)
-    assert any(fact["aperture_pixels"] > 1 for fact in facts)
-    assert all(fact["motion_pixels"] > 0.2 for fact in facts), "something moves while the shutter is open in each"
-    assert any(fact["world"] == "sky" for fact in facts)
-    assert max(fact["lights"] for fact in facts) >= 60
+    assert all(any(fact[kind] for fact in facts) for kind in (*kinds, "moving_lights"))
+    assert all(fact["motion_pixels"] > 0.1 for fact in facts), "pixels of a film of 384"
+    assert found["lens"]["aperture_pixels"] > 3
+    assert (found["garden"]["world"], found["closeup"]["world"], found["night"]["world"]) == ("sky", "image", "none")
+    assert found["lamps"]["lights"] >= 60
 
 
 def facts_at(name, seed=1):
@@ -380,142 +391,6 @@ def facts_at(name, seed=1):
     shot = ShotSettings(name, seed, tuple(range(1, 8)), (320, 180), {"noisy": 1}, film=(1920, 1080))
     description = cycles.build(shot, 0, 2)
     return bpy.context.scene, effects.facts_of(bpy.context.scene, shot.frames), description
-
-
-def places_of(scene, name):
-    """Return where an item is in the picture's middle crop, pixels from its middle, on frames 1 to 7: (7, 2)."""
-    from hybrid.simulate.effects import film_pixel
-
-    found = []
-    for frame in range(1, 8):
-        scene.frame_set(frame)
-        found.append(film_pixel(scene, scene.objects[name].matrix_world.translation) - (960, 540))
-    scene.frame_set(4)
-    return np.array(found)
-
-
-def blur_of(scene, name):
-    """Return the diameter of an item's circle of confusion on frames 1 to 7, in pixels of the film."""
-    camera, found = scene.camera, []
-    for frame in range(1, 8):
-        scene.frame_set(frame)
-        forward = camera.matrix_world.to_3x3().col[2] * -1
-        distance = (scene.objects[name].matrix_world.translation - camera.matrix_world.translation).dot(forward)
-        data, lens = camera.data, camera.data.lens / 1000
-        apart = abs(1 / data.dof.focus_distance - 1 / distance)
-        found.append(lens**2 / data.dof.aperture_fstop * apart / (data.sensor_width / 1000) * 1920)
-    scene.frame_set(4)
-    return np.array(found)
-
-
-def test_the_lens_shot_has_motion_in_focus_behind_it_before_it_and_through_it():
-    scene, facts, _ = facts_at("test:lens")
-    assert scene.camera.data.dof.use_dof
-    assert facts.aperture_pixels > 15
-    assert facts.transmissive == 0, "caustics of small lamps would be noise in the references"
-    assert blur_of(scene, "mug").min() > 5
-    assert (np.abs(places_of(scene, "mug")) < (160, 90)).all(), "the mug is in the picture on all frames"
-    for name, blurred in (("top", (0, 1)), ("lantern", (8, 40)), ("twig", (5, 60))):
-        blur = blur_of(scene, name)
-        assert blurred[0] <= blur.min(), name
-        assert blur.max() <= blurred[1], name
-        assert scene.objects[name].animation_data is not None, name
-    marble = blur_of(scene, "marble")
-    assert marble[0] > 1.5, "it rolls into focus"
-    assert marble[-1] < 0.8
-    for name in ("top", "lantern", "marble"):
-        places = places_of(scene, name)
-        assert (np.abs(places) < (160, 90)).all(), f"{name} is in the picture on all frames"
-        assert np.linalg.norm(np.diff(places, axis=0), axis=1).min() > 0.5, name
-
-
-def test_the_closeup_has_hair_glass_and_wheels_that_turn_in_mesh():
-    scene, facts, _ = facts_at("test:closeup")
-    hair = [item for item in scene.objects if item.type == "CURVES"]
-    assert sum(len(item.data.curves) for item in hair) > 20_000
-    assert all(item.parent.parent.name == "head" for item in hair), "the coat goes with the head"
-    assert facts.transmissive >= 3, "glass, jewels, and hair"
-    assert facts.world == "image"
-    head = [scene.objects["head"].rotation_euler.z, scene.frame_set(5), scene.objects["head"].rotation_euler.z]
-    assert head[2] > head[0]
-    wheels = [scene.objects[name] for name in ("gear", "gear.001", "gear.002")]
-    teeth = (40, 20, 27)
-    turns = []
-    for wheel in wheels:
-        assert wheel.data.materials[0].node_tree.nodes["Principled BSDF"].inputs["Metallic"].default_value == 1
-        angles = []
-        for frame in (4, 5):
-            scene.frame_set(frame)
-            angles.append(wheel.rotation_euler.z)
-        turns.append(angles[1] - angles[0])
-    # Wheels in mesh pass as many teeth as each other, the other way round.
-    passed = np.array(turns) * teeth
-    np.testing.assert_allclose(passed * (1, -1, 1), passed[0], rtol=0.06)
-
-
-def test_the_lamps_shot_pans_over_many_small_lamps_and_nothing_else_gives_light():
-    scene, facts, _ = facts_at("test:lamps")
-    assert facts.world == "none"
-    assert facts.lights >= 60
-    assert not [item for item in scene.objects if item.type == "LIGHT"], "every lamp is a thing in the picture"
-    shelf = np.diff(places_of(scene, "shelf"), axis=0)
-    assert (np.abs(shelf[:, 0]) > 3).all(), "the camera pans"
-    hook = scene.objects["pendant.001"]
-    assert hook.animation_data is not None
-    assert scene.objects["pendant"].animation_data is None
-
-
-def test_in_the_shadow_shot_the_sun_wanders_and_what_casts_shadows_moves():
-    scene, facts, _ = facts_at("test:shadow")
-    assert facts.moving_lights == 1
-    sun = next(item for item in scene.objects if item.type == "LIGHT")
-    assert sun.data.type == "SUN"
-    assert sun.data.angle < 0.02, "hard shadows"
-    bob = places_of(scene, "bob")
-    assert np.linalg.norm(np.diff(bob, axis=0), axis=1).max() > 3
-    assert (np.abs(bob) < (160, 90)).all()
-    wall = np.diff(places_of(scene, "vase"), axis=0)
-    assert np.abs(wall).max() < 2, "the camera nearly stands, so that it is shadows that move"
-    twigs = [item for item in scene.objects if item.name.startswith("twig")]
-    assert len(twigs) == 9
-    assert all(twig.animation_data is not None for twig in twigs), "leaves sway"
-
-
-def test_in_the_volume_shot_smoke_is_uneven_drifts_and_a_fan_turns_in_the_beam():
-    scene, facts, _ = facts_at("test:volume")
-    assert facts.volumes == 1
-    tree = next(material for material in scene.objects["smoke"].data.materials).node_tree
-    assert tree.nodes["Volume Scatter"].inputs["Density"].is_linked
-    drift = []
-    for frame in (4, 5):
-        scene.frame_set(frame)
-        drift.append(tuple(tree.nodes["Mapping"].inputs["Location"].default_value))
-    assert drift[0] != drift[1]
-    blade = np.diff(
-        [scene.objects["fan"].rotation_euler.y, scene.frame_set(4) or scene.objects["fan"].rotation_euler.y]
-    )
-    assert abs(blade[0]) > 0.03
-    beam = next(item for item in scene.objects if item.type == "LIGHT" and item.data.type == "SPOT")
-    along = beam.matrix_world.to_3x3().col[2] * -1
-    fan = scene.objects["fan"].matrix_world.translation - beam.matrix_world.translation
-    assert fan.normalized().dot(along) > np.cos(beam.data.spot_size / 2), "the fan is in the beam"
-
-
-def test_the_test_shots_show_something_that_moves(tmp_path):
-    """Tiny, without a pilot: what a film's middle shows, at a fifth of its size."""
-    for name in FIXED["test"]:
-        shot = ShotSettings(f"test:{name}", 1, (1, 2), SIZE, {"noisy": 4}, film=(384, 216), effects="all")
-        simulate([(shot, tmp_path / name)], threads=2)
-        channels = read(tmp_path / name / "noisy.0002.exr")
-        color = layer(channels, "Combined")
-        assert np.isfinite(color).all(), name
-        assert 0.05 < color.mean() < 1, name
-        assert (color.max(axis=-1) > 0).mean() > 0.6, f"{name}: light is found, even by so few samples"
-        assert color.std() > 0.3 * color.mean(), name
-        # A frame's motion at a fifth of the size of the film.
-        motion = np.linalg.norm(layer(channels, "Vector", "XY"), axis=-1)
-        assert motion.max() > 0.5, name
-        assert (channels["ViewLayer.Depth.Z"] < 1e9).mean() > 0.7, f"{name}: the picture is filled"
 
 
 @pytest.mark.parametrize(
