@@ -1,5 +1,6 @@
 """A Python environment for ravg, made with Blender's Python and pip. Independent of Blender."""
 
+import itertools
 import os
 import re
 import shutil
@@ -62,13 +63,9 @@ def bundled_wheel() -> Path | None:
 
 def new_environment(home: Path) -> Path:
     """A new folder for an environment; the current one stays until the new one is complete."""
-    current = _current(home)
-    for name in _environments(home):
-        if name != current:  # left by Blender's end during an installation
-            remove(home / name)
-    numbers = [int(name.rpartition("-")[2]) for name in _environments(home)]
+    _remove_others(home, _current(home))  # left by Blender's end during an installation
     # A short name: Windows takes paths of 259 letters. Torch needs 119 in site-packages, and a user's name may be long.
-    made = home / str(max(numbers, default=0) + 1)
+    made = next(path for path in (home / str(number) for number in itertools.count(1)) if not path.exists())
     temporary(made).mkdir(parents=True)
     return made
 
@@ -104,9 +101,7 @@ def finish(home: Path, environment: Path) -> None:
     mark = home / f"{_CURRENT}.new"
     mark.write_text(environment.name, encoding="utf-8")
     os.replace(mark, home / _CURRENT)
-    for name in _environments(home):
-        if name != environment.name:
-            remove(home / name)
+    _remove_others(home, environment.name)
 
 
 def remove(environment: Path) -> None:
@@ -138,11 +133,11 @@ def explain(log: str, *, online: bool) -> str:
     return f"{lines[0]}{missing}"
 
 
-def _environments(home: Path) -> list[str]:
-    if not home.is_dir():
-        return []
-    # Earlier versions named them environment-1.
-    return [path.name for path in home.iterdir() if re.fullmatch(r"(environment-)?\d+", path.name)]
+def _remove_others(home: Path, name: str) -> None:
+    """Remove all environments but one."""
+    for path in home.iterdir() if home.is_dir() else ():
+        if path.is_dir() and path.name != name:
+            remove(path)
 
 
 def _program(environment: Path, name: str) -> str:

@@ -1056,16 +1056,6 @@ answer = [install(), install(wheel=WHEEL, gpu=True), before, there()]  # the ind
 
 
 @pytest.mark.parametrize(
-    ("name", "reason"), [("gone.whl", "no wheel file"), ("torch-2-py3-none-any.whl", "no wheel of ravg")]
-)
-def test_a_file_that_is_no_wheel_of_ravg_is_refused(blender, tmp_path, name, reason):
-    path = tmp_path / name
-    if reason != "no wheel file":
-        path.touch()
-    assert reason in blender.run(INSTALLING + "answer = install(wheel=PATH)", command="", PATH=str(path))
-
-
-@pytest.mark.parametrize(
     ("says", "reason"),
     [
         ("ravg 99.2.5", f"ravg 99.2.5 is not of this extension's version, {VERSION.rpartition('.')[0]}"),

@@ -42,11 +42,11 @@ def test_nothing_is_installed_until_an_environment_is_complete(tmp_path):
 def test_a_new_environment_replaces_the_old_one_at_its_end_only(tmp_path, old):
     install.finish(tmp_path, environment(tmp_path, old))
     new = install.new_environment(tmp_path)
-    assert new.name == "10"
+    assert new.name == "1"
     install.remove(new)
     assert Path(install.installed(tmp_path)).parts[-3] == old
-    install.finish(tmp_path, environment(tmp_path, "10"))
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["10", "current.txt"]
+    install.finish(tmp_path, environment(tmp_path, "1"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1", "current.txt"]
 
 
 def test_paths_on_windows_leave_room_for_a_name_of_26_letters(tmp_path):
@@ -90,6 +90,17 @@ def test_the_index_is_asked_only_where_that_is_allowed_and_never_for_ravg(tmp_pa
         named = [word for asked in runs for word in asked if word.startswith("ravg")]
         assert named == [f"ravg[neural] @ {wheel.as_uri()}"]
         assert all(("--no-index" in asked) != online for asked in runs)
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"), [("gone.whl", "no wheel file"), ("torch-2-py3-none-any.whl", "no wheel of ravg")]
+)
+def test_a_file_that_is_no_wheel_of_ravg_is_refused(tmp_path, name, reason):
+    path = tmp_path / name
+    if reason != "no wheel file":
+        path.touch()
+    with pytest.raises((FileNotFoundError, ValueError), match=reason):
+        install.Source("0.1.4", path, True, False).requirements()
 
 
 @pytest.mark.parametrize(
