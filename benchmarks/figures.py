@@ -55,8 +55,8 @@ LADDER: dict[str, tuple[str, ...]] = {
     "hard31002": ("hard", "--seed", "31002"),
     "hard31004": ("hard", "--seed", "31004"),
     "random31002": ("random", "--seed", "31002"),
-    "table": ("validation:table", "--seed", "1"),
-    "garden": ("validation:garden", "--seed", "1"),
+    "table": ("table.blend",),
+    "garden": ("garden.blend",),
     "staircase": ("wooden_staircase.blend", *MOVES),
     "classroom": ("classroom.blend", *MOVES),
     "kitchen": ("country_kitchen.blend", *MOVES),
@@ -150,7 +150,9 @@ def find_shot(name: str, options: argparse.Namespace) -> Path:
         subprocess.run([sys.executable, script, renderer, str(folder), *words, "--references", "256"], check=True)
     else:
         scene, *words = LADDER[name]
-        if scene.endswith(".blend"):
+        if (own := ROOT / "examples" / "scenes" / scene).exists():
+            scene = str(own)
+        elif scene.endswith(".blend"):
             if options.scenes is None:
                 raise SystemExit(f"figures: expected {folder}, or --scenes with {scene}, got neither")
             scene = str(options.scenes / scene)
