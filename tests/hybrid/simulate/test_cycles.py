@@ -364,7 +364,7 @@ def test_the_scenes_of_the_examples_move_and_hold_every_effect(tmp_path):
     found = {}
     for path in sorted(SCENES.glob("*.blend")):
         out = tmp_path / path.stem
-        shot = ShotSettings(str(path), 1, (1, 2), SIZE, {"noisy": 2}, film=(384, 216), center=(0.5, 0.5), effects="all")
+        shot = ShotSettings(str(path), 1, (2,), SIZE, {"noisy": 2}, film=(384, 216), center=(0.5, 0.5), effects="all")
         simulate([(shot, out)], threads=2)
         plan = json.loads((out / "meta.json").read_text())["plan"]
         assert "motion" not in plan["description"], "a scene that moves gets no other motion"
