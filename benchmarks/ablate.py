@@ -39,8 +39,11 @@ def _ones(estimates: Any, *_: Any) -> Any:
     return np.ones(estimates.shape[1:3], np.float32)
 
 
-def _keep_picture(first: int, last: int, picture: Any, *others: Any) -> None:
-    others[-1][first:last] = picture[first:last]
+def _keep_picture(first: int, last: int, picture: Any, noisy: Any, *others: Any) -> None:
+    _, _, rate, _, blended, error = (part[first:last] if hasattr(part, "shape") else part for part in others)
+    blended[:] = picture[first:last]
+    limit = samples._LIMIT
+    error[:] = np.square(np.clip((noisy[first:last] - blended) * rate[..., None], -limit, limit)).sum(axis=-1)
 
 
 def _nothing(*_: Any, **__: Any) -> None:
