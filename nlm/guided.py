@@ -93,8 +93,9 @@ def measure_guide(guide: Floats) -> Doubles:
 def _standardise(guide: Floats, moments: Doubles) -> Floats:
     """Normalise each channel to mean 0 and variance 1; a constant channel becomes 0."""
     mean, deviation = moments
-    # what is below the rounding of float32 is no structure (and float64's rounding of the variance is 1e-8)
-    constant = deviation <= 1e-6 * np.abs(mean)
+    # Below the rounding of float32 there is no structure (float64's rounding of the variance is 1e-8); the inverse of a
+    # deviation below its normal numbers overflows.
+    constant = deviation <= np.maximum(1e-6 * np.abs(mean), np.finfo(np.float32).tiny)
     scale = np.where(constant, 0.0, 1.0 / np.where(constant, 1.0, deviation))
     # Whole rows at a time: numpy takes long over the short axis.
     centre, factor = (np.tile(np.float32(values), guide.shape[1]) for values in (mean, scale))
