@@ -68,7 +68,9 @@ def interruptible(report: Callable[[], None]) -> Iterator[None]:
             sys.stderr.flush()
 
     def watch() -> None:
-        ours.recv(1)
+        # A byte for each signal that has a handler, as libraries set them for ended child processes; 0 ends the watch.
+        while ours.recv(1)[0] not in (0, *INTERRUPTS):
+            pass
         if not left.wait(PATIENCE):
             remove_unfinished()
             say()

@@ -41,6 +41,22 @@ def test_the_end_of_standard_input_ends_a_long_computation(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.posix
+def test_other_signals_end_nothing():
+    code = """
+import os, signal, time
+from hybrid.runtime.interrupt import PATIENCE, interruptible
+signal.signal(signal.SIGCHLD, lambda *_: None)
+with interruptible(lambda: print("interrupted", flush=True)):
+    os.kill(os.getpid(), signal.SIGCHLD)
+    time.sleep(2 * PATIENCE)
+print("finished")
+"""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
+    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stdout) == (0, "finished\n")
+
+
 @pytest.mark.parametrize("asked", ["", "0"])
 def test_the_end_of_standard_input_ends_nothing_unless_asked(tmp_path, asked):
     child = start(tmp_path / "frame.exr", 1, RAVG_STOP_WITH_STDIN=asked)
