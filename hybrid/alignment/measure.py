@@ -51,6 +51,9 @@ WHOLE_PIXELS = 0.05
 # Areas whose means show changes that noise hides in 9×9 pixels: they must differ by more than a twentieth, and by eight
 # standard errors, as samples that a pixel filter spreads are alike in several pixels.
 AREA, AREA_CHANGE, AREA_NOISE = 32, 0.05, 8.0
+# Deviation, pixels, of the Gaussian mean of the ratio of light by which two frames are made equal before their noise is
+# compared.
+LIGHT_AROUND = 8.0
 # Two frames have fixed noise where more than this share of it is the same at equal pixels.
 FIXED_NOISE_ABOVE = 0.25
 # A frame repeats another where at least this share is equal: all but burned-in text.
@@ -328,7 +331,15 @@ def noise_correlation(frame: PreparedFrame, neighbour: PreparedFrame) -> Correla
     compared &= neighbour.valid[rows, columns]
     for guide, other in _guides(frame, neighbour):
         compared &= np.abs(guide[block] - other[rows, columns]).max(axis=-1) < SAME_SURFACE
-    first, second = channel_mean(frame.irradiance[block]), channel_mean(neighbour.irradiance[rows, columns])
+    first, second = frame.irradiance[block], neighbour.irradiance[rows, columns]
+    lit = (np.minimum(first, second) > 0).all(axis=-1) & compared
+    ratios = np.log(first, where=lit[..., None], out=np.zeros_like(first))
+    ratios -= np.log(second, where=lit[..., None], out=np.zeros_like(second))
+    ratios, counted = (cv2.GaussianBlur(layer, (0, 0), LIGHT_AROUND) for layer in (ratios, lit.astype(np.float32)))
+    # Below 1e-3 no pixel within 30 is lit in both.
+    second = second * np.exp(ratios / np.maximum(counted, np.float32(1e-3))[..., None])
+    compared &= counted > 1e-3
+    first, second = channel_mean(first), channel_mean(second)
     measured = measure_correlation(
         first - second, compared, np.float32(GRAIN) * np.maximum(np.abs(first), np.abs(second))
     )
