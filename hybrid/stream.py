@@ -314,12 +314,14 @@ class FrameStream:
         return self._cached("raw", (number,), self._read)
 
     def _correlation(self, number: int) -> Correlation | None:
-        """The correlation of a frame's noise by its difference to the frame before; of the first, to the one after."""
+        """The correlation of a frame's noise by its difference to the frame before; without one, to the one after."""
         before, _, after = self.around(number, 1)
-        pair = (before, number) if self.shot.has(before) else (number, after)
-        if "whiten" not in self.rules.allowed or not all(map(self.shot.has, pair)):
-            return None
-        return self._cached("correlation", pair, self._measure_correlation)
+        for pair in ((before, number), (number, after)):
+            if "whiten" in self.rules.allowed and all(map(self.shot.has, pair)):
+                found: Correlation | None = self._cached("correlation", pair, self._measure_correlation)
+                if found is not None:
+                    return found
+        return None
 
     def _measure_correlation(self, a: int, b: int) -> Correlation | None:
         try:

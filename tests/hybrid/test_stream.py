@@ -298,6 +298,18 @@ def test_the_filter_is_measured_from_the_frames_beside_a_frame_alone(tmp_path):
     np.testing.assert_array_equal(part.spread.inverse, expected.spread.inverse)
 
 
+def test_the_filter_of_the_first_frame_after_a_cut_is_measured_from_the_one_after(tmp_path):
+    def cut(index, layers):
+        if index < 3:
+            for name in ("Combined", "Denoising Albedo", "Denoising Normal"):
+                layers[f"ViewLayer.{name}"] = 1 - layers[f"ViewLayer.{name}"][::-1, ::-1]
+        spread_layers(index, layers)
+
+    stream = FrameStream(open_shot(GRAINY.write(tmp_path, edit=cut)), Rules())
+    assert stream.frame(1004).spread is not None
+    np.testing.assert_array_equal(stream.frame(1004).spread.inverse, stream.frame(1005).spread.inverse)
+
+
 def test_texture_that_moves_is_no_noise(tmp_path):
     folder = GRAINY.write(tmp_path, without={"Vector", "Denoising Albedo", "Denoising Normal"})
     assert FrameStream(open_shot(folder), Rules(on=frozenset({"whiten"}))).frame(1003).spread is None

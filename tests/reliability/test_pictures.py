@@ -13,6 +13,9 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from hybrid.files.shots import open_shot
+from hybrid.plan import Rules
+from hybrid.stream import FrameStream
 from tests.commands import ravg
 from tests.reliability.shots import (
     ALBEDO,
@@ -79,6 +82,13 @@ def sparks(count: int, value: float = 5000) -> Edit:
     return late
 
 
+def spread(index: int, layers: Layers) -> None:
+    """A pixel filter of three pixels, which is undone; after a cut it is measured from later frames."""
+    taps = np.array([0.2, 1, 0.2]) / 1.4
+    for name in (COLOR, ALBEDO, NORMAL):
+        layers[name] = cv2.sepFilter2D(layers[name], -1, taps, taps, borderType=cv2.BORDER_REFLECT_101)
+
+
 # Event → changes before and after noise.
 EVENTS: dict[str, tuple[Edit | None, Edit | None]] = {
     "a frame five times brighter": (flare(5), None),
@@ -94,6 +104,17 @@ EVENTS: dict[str, tuple[Edit | None, Edit | None]] = {
 def test_a_frame_is_the_same_in_chunks(folder, event):
     noisy = shot(folder / "in", 18, *event)
     for out, frames in (("all", "1001-1018"), ("part", "1005-1007"), ("part", "1008")):
+        ravg("denoise", noisy, "-o", folder / out, *DRAFT, "--frames", frames).succeeds()
+    same(folder / "part", folder / "all")
+
+
+@cases({"throughout": None, "with a cut": cut}, "event")
+def test_a_frame_whose_pixels_share_noise_is_the_same_in_chunks(folder, event):
+    """Frame 1007 is the first after the cut."""
+    noisy = shot(folder / "in", 9, event, spread, size=(96, 128))
+    stream = FrameStream(open_shot(noisy), Rules())
+    assert all(stream.rendered(number).spread is not None for number in range(1001, 1010))
+    for out, frames in (("all", "1001-1009"), ("part", "1006-1007"), ("part", "1008")):
         ravg("denoise", noisy, "-o", folder / out, *DRAFT, "--frames", frames).succeeds()
     same(folder / "part", folder / "all")
 
