@@ -377,7 +377,7 @@ class _Report:
             if self.job.options.method == "network" or decision.stage not in NEURAL_STAGES:
                 LOG.debug(f"  {'run' if decision.on else 'not run'}: {decision.stage} ({decision.reason})")
         if merged is not None:
-            shots.log_seed(merged)
+            shots.log_noise(merged)
         stages = {name: asdict(stage) for name, stage in timings.stages.items()}
         LOG.debug(timings.table(self.pixels), extra={"facts": {"stages": stages}})
 

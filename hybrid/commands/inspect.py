@@ -17,7 +17,7 @@ from hybrid.commands.shots import (
     in_view,
     log_cuts,
     log_findings,
-    log_seed,
+    log_noise,
     split_stages,
     views_of,
 )
@@ -84,7 +84,10 @@ def _inspect(read: ShotInput, rules: Rules, *, as_json: bool) -> None:
         typer.echo(json.dumps(document, indent=1))
         return
     console = Console()
-    roles = [*(found.role for found in findings if found.warning), *("seed" for plan in plans if log_seed(plan))]
+    roles = [
+        *(found.role for found in findings if found.warning),
+        *(found for plan in plans for found in log_noise(plan)),
+    ]
     console.print(_verdict(["files"] * len(shot.warnings) + roles))
     console.print(f"{len(shot)} frames, {shot.numbers[0]}-{shot.numbers[-1]}, {width}×{height}", highlight=False)
     console.print(

@@ -168,13 +168,19 @@ def log_cuts(plan: Plan, known: Sequence[Finding], *, strict: bool, name: str = 
     return [*cuts, *repeats]
 
 
-def log_seed(plan: Plan) -> bool:
-    """Warn if the plan finds one seed for all frames; return whether it does."""
-    found = [decision for decision in plan.decisions if decision.stage == "fixed-noise" and not decision.forced]
-    for decision in found:
-        if decision.on:
+def log_noise(plan: Plan) -> list[str]:
+    """Warn of noise that averaging does not remove: one seed for all frames, too wide a filter; return the causes."""
+    found = []
+    for decision in plan.decisions:
+        if decision.forced or decision.figure is None or decision.threshold is None:
+            continue
+        if decision.stage == "fixed-noise" and decision.on:
+            found.append("seed")
             LOG.warning(f"constant seed: {decision.reason}")
-    return any(decision.on for decision in found)
+        elif decision.stage == "whiten" and not decision.on and decision.figure > decision.threshold:
+            found.append("pixel filter")
+            LOG.warning(f"pixel filter: {decision.reason} (docs/renderers.md)")
+    return found
 
 
 def split_stages(names: Sequence[str] | None) -> tuple[str, ...]:

@@ -185,6 +185,20 @@ def test_one_seed_for_all_frames_is_said_by_inspect_too(tmp_path, capsys):
     assert "warning: constant seed: " in err
 
 
+def test_noise_that_is_wider_than_any_filter_that_can_be_undone_is_warned_of(tmp_path, capsys):
+    def edit(index, layers):
+        light = layers["ViewLayer.Combined"]
+        noise = cv2.GaussianBlur(np.random.default_rng(index).normal(0, 1, light.shape[:2]), (0, 0), 2)
+        light *= np.float32(1 + 0.3 * noise / noise.std())[..., None]
+
+    folder = Scene(height=96, width=128, step=(0, 0)).write(tmp_path / "in", clean=True, edit=edit)
+    _, out, err = run(capsys, "inspect", folder)
+    assert "pixel filter" in out.splitlines()[0]
+    assert "render with a narrower one (docs/renderers.md)" in err
+    _, _, err = run(capsys, "denoise", folder, "-o", tmp_path / "out", "--preset", "draft")
+    assert "warning: pixel filter: " in err
+
+
 def test_denoise_writes_denoised_frames_that_keep_everything_else(tmp_path, capsys):
     scene = Scene()
     folder, out = scene.write(tmp_path / "in"), tmp_path / "out"
