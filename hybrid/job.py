@@ -196,7 +196,7 @@ class DenoiseOptions:
     def weights_file(self) -> Path | None:
         """The file of the network's weights; with the preset "auto", that of the most accurate preset."""
         if self.method != "network" or self.weights is not None:
-            return None if self.weights is None else Path(self.weights)
+            return None if self.weights is None else Path(import_neural().find_weights(self.weights))
         return Path(import_neural().shipped_weights(MEASURED[0] if self.preset == "auto" else self.preset))
 
     @property

@@ -203,8 +203,11 @@ def _open(path: str | os.PathLike[str]) -> Iterator[tuple[Any, dict[str, str]]]:
 
 
 def find_weights(name: str) -> Path:
-    """Path of a file of weights, or of those of a preset that ships; ValueError for a preset that does not."""
-    return Path(name) if Path(name).suffix else shipped_weights(name)
+    """Path of a file of weights, or of those of a preset, ``ra`` or ``tkpcn``; ValueError for another name."""
+    if Path(name).suffix:
+        return Path(name)
+    path = Path(__file__).parent / "paper" / "weights" / f"{name}.safetensors"
+    return path if path.is_file() else shipped_weights(name)
 
 
 def shipped_weights(preset: str) -> Path:
@@ -213,7 +216,7 @@ def shipped_weights(preset: str) -> Path:
     path = folder / f"{preset}.safetensors"
     if path.is_file():
         return path
-    if (path := folder.parent / "paper" / "weights" / f"{preset}.safetensors").is_file():
-        raise ValueError(f"preset is {preset!r}, which is no preset any more, expected its weights by name: {path}")
+    if (folder.parent / "paper" / "weights" / f"{preset}.safetensors").is_file():
+        raise ValueError(f"preset is {preset!r}, a network for research, expected --weights {preset}")
     shipped = ", ".join(sorted(p.stem for p in folder.glob("*.safetensors"))) or "none"
     raise ValueError(f"preset is {preset!r}, expected one of: {shipped}")

@@ -150,8 +150,7 @@ def _denoiser(preset: str, tile: int | None, precision: str, threshold: float | 
     """A network with the weights of a preset, loaded once."""
     from hybrid import neural  # torch may be absent
 
-    weights = neural.TKPCN_WEIGHTS if preset == "tkpcn" else neural.shipped_weights(preset)
-    return neural.open_network(weights, tile=tile, precision=precision, threshold=threshold)
+    return neural.open_network(neural.find_weights(preset), tile=tile, precision=precision, threshold=threshold)
 
 
 def aligned_average(aligned: AlignedWindow) -> Array:
@@ -237,6 +236,7 @@ METHODS: dict[str, Method] = {
     "gated OIDN": _aligned("Gated averages", gated_average, source="oidn"),
     "fast without OIDN": _network("fast", "bundled"),
     **{preset: _network(preset, OIDN_MODE_OF_NETWORKS) for preset in NETWORKS},
+    "RA": _network("ra", "none"),
     "tKPCN": _network("tkpcn", "none"),
     "OIDN fast": _oidn("fast"),
     "OIDN high": _oidn("high"),

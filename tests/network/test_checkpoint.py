@@ -16,7 +16,7 @@ torch = pytest.importorskip("torch")
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from network.checkpoint import build, describe, load_model, save_model, shipped_weights
+from network.checkpoint import build, describe, find_weights, load_model, save_model, shipped_weights
 from network.paper.models import RAResNet, RAResNetConfig
 from tests.network.small import MODELS, make_model, make_robust, notes_of
 
@@ -141,9 +141,15 @@ def test_older_files_of_the_papers_networks_are_read_and_those_of_the_final_stag
                 load_model(old)
 
 
-def test_tkpcn_is_no_preset_any_more_and_its_weights_are_named() -> None:
-    with pytest.raises(ValueError, match=r"preset is 'tkpcn', which is no preset.*paper.weights.tkpcn\.safetensors"):
-        shipped_weights("tkpcn")
+def test_networks_of_the_paper_are_weights_by_name_and_no_presets() -> None:
+    for name in ("ra", "tkpcn"):
+        assert find_weights(name).is_file()
+        with pytest.raises(ValueError, match=f"preset is '{name}', a network for research, expected --weights {name}"):
+            shipped_weights(name)
+    assert find_weights("fast") == shipped_weights("fast")
+    assert find_weights("mine.safetensors") == Path("mine.safetensors")
+    with pytest.raises(ValueError, match="preset is 'other', expected one of"):
+        find_weights("other")
 
 
 def test_no_preset_needs_the_papers_networks() -> None:

@@ -10,8 +10,7 @@ from hybrid.files.shots import open_shot  # noqa: E402
 from hybrid.neural import open_network  # noqa: E402
 from hybrid.neural.oidn_networks import HALO, SCRATCH, TILE  # noqa: E402
 from hybrid.stream import FrameStream  # noqa: E402
-from network.checkpoint import save_model, shipped_weights  # noqa: E402
-from network.paper import TKPCN_WEIGHTS  # noqa: E402
+from network.checkpoint import find_weights, save_model, shipped_weights  # noqa: E402
 from network.presets import build_preset  # noqa: E402
 
 pytestmark = pytest.mark.neural
@@ -35,7 +34,7 @@ def test_bad_options_are_refused(weights):
 
 
 def test_the_denoiser_is_that_of_the_weights():
-    final, kernels = open_network(shipped_weights("quality")), open_network(TKPCN_WEIGHTS)
+    final, kernels = open_network(shipped_weights("quality")), open_network(find_weights("tkpcn"))
     assert (final.needs_first_pass, final.radius, final.tile) == (True, 3, 2048)
     assert (kernels.needs_first_pass, kernels.radius, kernels.tile) == (False, 2, 640)
 

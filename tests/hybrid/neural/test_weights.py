@@ -18,8 +18,7 @@ from hybrid.neural import open_network
 from hybrid.plan import Rules
 from hybrid.pseudo_reference import FINAL, filter_window, gated_average
 from hybrid.stream import FrameStream
-from network.checkpoint import load_model, save_model, shipped_weights
-from network.paper import TKPCN_WEIGHTS
+from network.checkpoint import find_weights, load_model, save_model, shipped_weights
 from network.presets import build_preset
 from network.robust_average import RobustAverage
 from nlm.average import robust_average
@@ -43,7 +42,7 @@ def picture(denoiser):
 
 @lru_cache
 def picture_of(preset):
-    return picture(open_network(TKPCN_WEIGHTS if preset == "tkpcn" else shipped_weights(preset)))
+    return picture(open_network(find_weights(preset)))
 
 
 @lru_cache
@@ -64,15 +63,15 @@ def test_final_gains_what_is_promised_on_the_bundled_shot(reference):
     assert gained > robust + 2
 
 
-@pytest.mark.parametrize("preset", [*NETWORKS, "tkpcn"])
+@pytest.mark.parametrize("preset", [*NETWORKS, "ra", "tkpcn"])
 def test_weights_reach_what_their_card_says(reference, preset):
-    path = TKPCN_WEIGHTS if preset == "tkpcn" else shipped_weights(preset)
+    path = find_weights(preset)
     card = path.with_suffix(".md").read_text(encoding="utf-8")
     promised = float(re.search(r"frame 11 of the bundled shot: (\d+\.\d+) dB", card)[1])
     image = picture_of(preset)
     # bfloat16 or float32, one processor or another: hundredths of a decibel
     assert psnr(image, reference) == pytest.approx(promised, abs=0.1)
-    assert preset == "tkpcn" or psnr(image, reference) > psnr(final(), reference)
+    assert preset in ("ra", "tkpcn") or psnr(image, reference) > psnr(final(), reference)
     assert abs(mean_bias(image, reference)) < 0.01
 
 
