@@ -417,7 +417,8 @@ PICTURES = {"motion.webp": draw_motion, "flicker.png": draw_flicker, "filter.png
 
 def write(record: Record, options: argparse.Namespace) -> None:
     """Write the file of figures, the blocks of the pages and the pictures."""
-    ladder.draw(record.values["ladder"], IMAGES / "ladder.png")
+    seconds = {method: cost for method, (cost, _) in record.values["times"].items()}
+    ladder.draw(record.values["ladder"], seconds, IMAGES / "ladder.png")
     for draw in PICTURES.values():
         draw(options)
     names = ("ladder.png", *PICTURES)

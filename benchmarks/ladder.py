@@ -31,12 +31,19 @@ from hybrid.files.shots import Shot
 from hybrid.oidn import denoise_oidn
 
 OIDN = {"oidn-high": None, "oidn-best": "high"}
-METHODS = ("noisy", *OIDN, "fast", "balanced", "quality")
+# Networks and averages from noisy frames alone, by the options of `denoise_shot`.
+NOISY_ALONE: dict[str, dict[str, str]] = {
+    "final": {"method": "classical", "preset": "final"},
+    "ra": {"weights": "ra"},
+    "tkpcn": {"weights": "tkpcn"},
+}
+PRESETS = ("fast", "balanced", "quality")
+METHODS = ("noisy", *OIDN, *PRESETS, *NOISY_ALONE)
 MOST = 65.0
 
 
 def denoise(shot: Shot, method: str, **options: object) -> list[Array]:
-    """The frames of a shot by a method; options are those of a preset."""
+    """The frames of a shot by a method; options are those of `denoise_shot`."""
     frames = [shot.read(number) for number in shot.numbers]
     if method == "noisy":
         return [frame.color for frame in frames]
@@ -44,7 +51,7 @@ def denoise(shot: Shot, method: str, **options: object) -> list[Array]:
         return [denoise_oidn(f.color, f.albedo, f.normal, prefilter=OIDN[method]) for f in frames]  # type: ignore
     with tempfile.TemporaryDirectory() as folder:
         pattern = f"{folder}/frame.####.exr"
-        list(denoise_shot(shot, pattern, preset=method, **options))
+        list(denoise_shot(shot, pattern, **NOISY_ALONE.get(method, {"preset": method}), **options))  # type: ignore
         made = open_shot(pattern)
         return [made.read(number).color for number in shot.numbers]
 
@@ -70,7 +77,7 @@ class Truth:
 
     def judge(self, shot: Shot, images: list[Array]) -> list[float]:
         """PSNR of the images of a shot, and temporal PSNR where there are vectors: means over the frames, dB."""
-        figures = [np.mean([psnr(image, pair) for image, pair in zip(images, self.references, strict=True)])]
+        figures = [np.mean([min(psnr(*pair), MOST) for pair in zip(images, self.references, strict=True)])]
         frames = [shot.read(number) for number in shot.numbers]
         motion = [motion_between(*pair) for pair in pairwise(frames)]
         if motion and None not in motion:
@@ -95,6 +102,12 @@ def judge(folder: Path, methods: list[str], results: dict[str, list[float]], out
             print(key, *results[key], flush=True)
 
 
+def medians(results: dict[str, list[float]]) -> dict[str, float]:
+    """CPU seconds a frame of each method, the median of all shots and levels."""
+    methods = dict.fromkeys(key.split(" ")[2] for key in results)
+    return {m: float(np.median([v[-1] for key, v in results.items() if key.endswith(f" {m}")])) for m in methods}
+
+
 def table(results: dict[str, list[float]]) -> str:
     """Means of each level and method, in Markdown."""
     rows = [key.split(" ") for key in results]
@@ -105,14 +118,16 @@ def table(results: dict[str, list[float]]) -> str:
         for level in names:
             figures = [v[:-1] for key, v in results.items() if key.endswith(f" {level} {method}")]
             cells.append(" / ".join(f"{np.mean(column):.2f}" for column in zip(*figures, strict=True)))
-        seconds = [values[-1] for key, values in results.items() if key.endswith(f" {method}")]
-        cells.append(f"{np.median(seconds):.2f} s")
+        cells.append(f"{medians(results)[method]:.2f} s")
         lines.append(f"| {method} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
-def draw(results: dict[str, list[float]], path: Path) -> None:
-    """Draw both figures against the samples that names of levels end with, such as s032, and PSNR against CPU time."""
+def draw(results: dict[str, list[float]], seconds: dict[str, float], path: Path) -> None:
+    """Draw both figures against the samples that names of levels end with, such as s032, and PSNR against CPU time.
+
+    `seconds` are CPU seconds a frame of each method; those without any are left out of the third chart.
+    """
     import matplotlib
 
     matplotlib.use("svg")
@@ -130,15 +145,11 @@ def draw(results: dict[str, list[float]], path: Path) -> None:
             means = [np.mean([figures[index] for figures in shots]) for shots in points.values()]
             axis.plot(list(points), means, style, marker=".", label=method)
             axis.set_xticks(sorted(points), [str(count) for count in sorted(points)], minor=False)
-        if method != "noisy":
-            every = [figures for shots in points.values() for figures in shots]
-            accuracy, seconds = (
-                np.mean([figures[0] for figures in every]),
-                np.median([figures[-1] for figures in every]),
-            )
+        if method in seconds:
+            accuracy = np.mean([figures[0] for shots in points.values() for figures in shots])
             (line,) = axes[0].lines[-1:]
-            axes[2].plot(seconds, accuracy, "o", color=line.get_color())
-            axes[2].annotate(method, (seconds, accuracy), xytext=(5, 4), textcoords="offset points", fontsize=8)
+            axes[2].plot(seconds[method], accuracy, "o", color=line.get_color())
+            axes[2].annotate(method, (seconds[method], accuracy), xytext=(5, 4), textcoords="offset points", fontsize=8)
     for axis, title in zip(axes, ("PSNR, dB", "temporal PSNR, dB", "PSNR, dB, mean of all levels"), strict=True):
         axis.set(xscale="log", xlabel="samples per pixel", title=title)
         axis.minorticks_off()
@@ -153,7 +164,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("-o", "--output", type=Path, required=True, help="JSON, continued if it is there")
-    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=["noisy", *OIDN, *PRESETS])
     parser.add_argument("--chart", type=Path)
     options = parser.parse_args()
     results = json.loads(options.output.read_text(encoding="utf-8")) if options.output.exists() else {}
@@ -161,7 +172,7 @@ def main() -> int:
         judge(folder, options.methods, results, options.output)
     print(table(results))
     if options.chart:
-        draw(results, options.chart)
+        draw(results, medians(results), options.chart)
     return 0
 
 
