@@ -31,3 +31,8 @@ def test_presets_are_reproducible_and_leave_the_global_generator_alone() -> None
 
 def test_without_a_length_windows_are_as_long_as_usual() -> None:
     assert [build_preset(name).frames for name in ("fast", "quality")] == [5, 7]
+
+
+def test_the_papers_network_and_its_baseline_are_of_equal_size() -> None:
+    ra, baseline = (sum(p.numel() for p in build_preset(name).parameters()) for name in ("ra", "tkpcn"))
+    assert baseline == pytest.approx(ra, rel=0.02)

@@ -31,13 +31,15 @@ from tests.network.small import MODELS, make_model, make_robust, notes_of
 pytestmark = pytest.mark.neural
 
 
-def make_clip(seed: int, clean_target: bool = False, size: int = 40) -> Clip:
-    """A smooth picture under strong noise; two independent renders of it, and a poor estimate."""
+def make_clip(seed: int, clean_target: bool = False, size: int = 40, sharp: bool = False) -> Clip:
+    """A smooth picture under strong noise, or a sharp one under slight; two renders of it, and a poor estimate."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:size, :size].astype(np.float32) / size
     waves = [1 + np.sin(5 * x * rng.uniform(-1, 1) + 5 * y * rng.uniform(-1, 1) + rng.uniform(0, 6)) for _ in range(3)]
     clean = np.stack(waves) + 0.1
-    noisy = clean * rng.gamma(2, 0.5, (2, 3, 1, size, size))
+    clean = np.where(clean > 1.1, 2.0, 0.2) if sharp else clean
+    shape = 200 if sharp else 2
+    noisy = clean * rng.gamma(shape, 1 / shape, (2, 3, 1, size, size))
     flat = np.broadcast_to(clean.mean((1, 2), keepdims=True), noisy.shape)
     images = {
         "color": noisy,
@@ -372,6 +374,19 @@ def test_every_model_learns_with_all_of_its_weights(
     losses = train(sets[0], sets[0].of([]), model, config, tmp_path / "w.safetensors")
     assert np.isfinite(losses).all()
     assert all(not torch.equal(p, q) for p, q in zip(model.parameters(), before, strict=True))
+
+
+@pytest.mark.parametrize("name", ["resnet", "tkpcn"])
+def test_a_training_ends_with_weights_better_than_it_began(name: str, tmp_path: Path) -> None:
+    """On a shot that it was not trained on: a network begins with means over 3×3 pixels, and learns of edges."""
+    for seed in range(4):
+        write_shards(tmp_path, f"shot{seed}", (4, 4), [make_clip(seed, clean_target=True, sharp=True)])
+    training, validation = split_by_shot(open_clips(tmp_path), ["shot3"])
+    before = validate(MODELS[name](), validation)
+    config = replace(CONFIG, steps=60, rate=1e-2)
+    train(training, validation, MODELS[name](), config, tmp_path / "w.safetensors")
+    after = validate(load_model(tmp_path / "w.safetensors"), validation)
+    assert after["denoised"] > before["denoised"] + 3
 
 
 def test_what_is_logged_tells_how_it_goes(sets: tuple[Clips, Clips], tmp_path: Path) -> None:
