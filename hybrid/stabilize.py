@@ -19,6 +19,7 @@ from hybrid.alignment.unfiltered import as_gray
 from hybrid.alignment.window import AlignedWindow, Geometry, Window
 from hybrid.files.frame import Frame
 from hybrid.plan import Plan
+from hybrid.runtime.allocator import return_freed_memory
 from hybrid.stream import FrameStream
 from hybrid.validation import find_lost_light, find_nonfinite
 from nlm.average import average, channel_mean
@@ -149,6 +150,7 @@ class FrameDenoiser:
         for n in averaged:
             if n not in self._results or (n == number and not self._results[n].geometry):
                 self.stream.keep({*self.stream.around(n, self.stream.support), *averaged})
+                return_freed_memory()  # of the window before: `balanced` took 2.6 in place of 2.2 GiB in float32
                 try:
                     self._results[n] = self.stream.keeper.keep(_needed(self._denoise_window(n), n >= number))
                 except (ValueError, OSError):

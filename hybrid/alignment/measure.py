@@ -338,7 +338,7 @@ def noise_correlation(frame: PreparedFrame, neighbour: PreparedFrame) -> Correla
     ratios, counted = (cv2.GaussianBlur(layer, (0, 0), LIGHT_AROUND) for layer in (ratios, lit.astype(np.float32)))
     # Below 1e-3 no pixel within 30 is lit in both.
     second = second * np.exp(ratios / np.maximum(counted, np.float32(1e-3))[..., None])
-    compared &= counted > 1e-3
+    compared &= (counted > 1e-3) & ((first != 0) | (second != 0)).any(axis=-1)  # what is black in both has no noise
     first, second = channel_mean(first), channel_mean(second)
     measured = measure_correlation(
         first - second, compared, np.float32(GRAIN) * np.maximum(np.abs(first), np.abs(second))

@@ -23,6 +23,7 @@ from hybrid.alignment.measure import (
 )
 from hybrid.alignment.prepare import prepare
 from hybrid.files.frame import Frame
+from tests.reliability.test_noise_ladder import scene
 
 
 @pytest.mark.parametrize("changed", [0.0, 0.005, 0.009, 0.02, 0.05, 1.0])
@@ -131,6 +132,19 @@ def test_light_that_changes_between_frames_is_no_correlation_of_their_noise(ligh
     along_x, along_y = noise_correlation(frame(1, (1, 1, 1)), frame(2, light))
     expected = 0.4 / 1.08 if filtered else 0
     assert (along_x[0], along_y[0]) == pytest.approx((expected, expected), abs=0.04)
+
+
+def test_an_object_on_black_has_no_correlation_of_noise_at_its_outline():
+    """At 10 % of noise its outline was taken for a pixel filter of 0.16, as black pixels were counted."""
+
+    def frame(number):
+        layers, color = scene("object", number)
+        grain = np.random.default_rng((2, number)).gamma(100, 0.01, (*color.shape[:2], 1))
+        albedo = layers["ViewLayer.Denoising Albedo"].astype(np.float32)
+        return prepare(Frame(number=number, color=(color * grain).astype(np.float32), albedo=albedo))
+
+    correlation = noise_correlation(frame(1), frame(2))
+    assert correlation is None or np.abs(correlation).max() < 0.1
 
 
 def test_frames_without_common_light_have_no_correlation():
