@@ -13,6 +13,7 @@ writes motion vectors: they are computed from the first surface at the middle of
 """
 
 import argparse
+import os
 import sys
 import tempfile
 import time
@@ -316,6 +317,8 @@ def main() -> int:
         write_layers(path.with_suffix(".part"), layers, attributes=attributes)
         path.with_suffix(".part").replace(path)
         print(path, flush=True)
+    if options.renderer.startswith("luxcore"):
+        os._exit(0)  # pyluxcore may crash while the interpreter ends
     return 0
 
 
