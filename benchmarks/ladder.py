@@ -134,6 +134,8 @@ def draw(results: dict[str, list[float]], seconds: dict[str, float], path: Path)
     from matplotlib import pyplot
 
     _, axes = pyplot.subplots(1, 3, figsize=(13, 3.4), layout="constrained")
+    for axis in axes[:2]:
+        axis.set_xscale("log")  # sets ticks of its own
     for method in dict.fromkeys(key.split(" ")[2] for key in results):
         points: dict[int, list[list[float]]] = {}
         for key, figures in results.items():
@@ -151,11 +153,11 @@ def draw(results: dict[str, list[float]], seconds: dict[str, float], path: Path)
             axes[2].plot(seconds[method], accuracy, "o", color=line.get_color())
             axes[2].annotate(method, (seconds[method], accuracy), xytext=(5, 4), textcoords="offset points", fontsize=8)
     for axis, title in zip(axes, ("PSNR, dB", "temporal PSNR, dB", "PSNR, dB, mean of all levels"), strict=True):
-        axis.set(xscale="log", xlabel="samples per pixel", title=title)
+        axis.set(xlabel="samples per pixel", title=title)
         axis.minorticks_off()
         axis.grid(alpha=0.3)
-    axes[2].set(xscale="linear", xlabel="CPU seconds a frame", xlim=(0, None))
     axes[2].margins(0.15)
+    axes[2].set(xlabel="CPU seconds a frame", xlim=(0, None))
     axes[0].legend(frameon=False, fontsize=8)
     pyplot.savefig(path, dpi=110)
 
