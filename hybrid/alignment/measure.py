@@ -311,7 +311,9 @@ def fixed_noise(frame: PreparedFrame, neighbour: PreparedFrame, *, moves: bool, 
 
 
 def noise_correlation(frame: PreparedFrame, neighbour: PreparedFrame) -> Correlation | None:
-    """Correlation of the noise of two neighbours (`nlm.pixel_filter.measure_correlation`); None where it is unknown.
+    """Correlation of the noise of two neighbours (`nlm.pixel_filter.measure_correlation`): 0 without noise.
+
+    None where it is unknown, as at a cut, where most of the picture is not comparable.
 
     Frames are compared along whole pixels of the vectors, in the middle of the picture, where their guides agree.
     Without vectors and albedo nothing tells texture that moves from noise.
@@ -343,6 +345,8 @@ def noise_correlation(frame: PreparedFrame, neighbour: PreparedFrame) -> Correla
     measured = measure_correlation(
         first - second, compared, np.float32(GRAIN) * np.maximum(np.abs(first), np.abs(second))
     )
+    if measured is None and compared.mean() > CUT:
+        measured = np.zeros((2, 4))  # both show the same, without noise
     return None if measured is None else (tuple(measured[0].tolist()), tuple(measured[1].tolist()))
 
 

@@ -153,3 +153,10 @@ def test_frames_without_common_light_have_no_correlation():
         Frame(number=1, color=color * k, albedo=np.full_like(color, 0.5)) for k in (np.float32(1), np.float32(0))
     )
     assert noise_correlation(prepare(lit), prepare(black)) is None
+
+
+def test_equal_frames_without_noise_have_a_correlation_of_0():
+    """So that the frame after is not read for it."""
+    color = np.random.default_rng(2).gamma(4, 0.1, (160, 240, 3)).astype(np.float32)
+    frame = prepare(Frame(number=1, color=color, albedo=np.full_like(color, 0.5)))
+    assert not np.any(noise_correlation(frame, frame))
