@@ -232,7 +232,12 @@ def denoise_arrays(
         denoiser = open_denoiser(chosen)
         source = choose_first_pass(cast("Shot", shot), chosen, denoiser)
         stream = FrameStream(
-            shot, chosen.rules, source.first_pass, radius=denoiser.radius, filter_guides=denoiser.filter_guides
+            shot,
+            chosen.rules,
+            source.first_pass,
+            radius=denoiser.radius,
+            filter_guides=denoiser.filter_guides,
+            reads_guides=denoiser.reads_guides,
         )
         denoise = FrameDenoiser(stream, denoiser, strength=chosen.strength)
         if wanted and (doubt := _doubt_vectors(shot, wanted[0])) is not None:

@@ -54,7 +54,14 @@ def measure_presets(
         # A sequence holds whole frames, and only a part is measured.
         whole = source.name == "sequence"
         given: FirstPass | None = PerFrame(lambda frame: frame.color) if whole else source.first_pass
-        stream = FrameStream(part, rules, given, radius=denoiser.radius, filter_guides=denoiser.filter_guides)
+        stream = FrameStream(
+            part,
+            rules,
+            given,
+            radius=denoiser.radius,
+            filter_guides=denoiser.filter_guides,
+            reads_guides=denoiser.reads_guides,
+        )
         frames, spent = FrameDenoiser(stream, denoiser), []
         for number in numbers:
             start = time.perf_counter()

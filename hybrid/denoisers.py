@@ -18,6 +18,7 @@ class WindowDenoiser(Protocol):
     needs_first_pass: ClassVar[bool] = True  # whether windows must hold a first pass
     clamps: bool = False  # whether results are clamped to `AlignedWindow.sample_range`
     guided: bool = True  # whether `AlignedWindow.guide` or its confidence by geometry is read where there are no AOVs
+    reads_guides: bool = True  # whether windows' guides, or samples beside first passes, are read
     packages: ClassVar[tuple[str, ...]] = ()  # packages that pixels depend on
 
     @property
@@ -70,6 +71,7 @@ class AverageDenoiser(WindowDenoiser):
     """The gated average of a first pass (`hybrid.pseudo_reference.gated_average`)."""
 
     timings: Timings
+    reads_guides = False
 
     def __call__(self, aligned: AlignedWindow) -> Denoised:
         return Denoised(gated_average(aligned, timings=self.timings))

@@ -186,6 +186,7 @@ class _ShotDenoiser:
                 view.first_pass,
                 radius=radius,
                 filter_guides=getattr(denoise, "filter_guides", None),  # a denoiser may be a plain function
+                reads_guides=getattr(denoise, "reads_guides", True),
                 timings=timings,
                 keeper=keeper,
             )

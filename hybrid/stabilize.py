@@ -195,7 +195,7 @@ class FrameDenoiser:
         stream, numbers = self.stream, self.stream.around(number)
         window: Window | None = stream.window(number)
         assert window is not None
-        plan = stream.plan(numbers, stream.context(window.first_pass is not None, stream.radius))
+        plan = stream.plan(numbers, stream.context(number, window.first_pass is not None, stream.radius))
         brightest = 0.0
         for frame in window.frames:
             brightest = brightest if frame is None else max(brightest, frame.mean)
@@ -209,22 +209,24 @@ class FrameDenoiser:
             assert window is not None
             # A denoiser may be a plain function.
             ranged, guided = getattr(self.denoise, "clamps", False), getattr(self.denoise, "guided", True)
-            aligned = align(window, band, ranged=ranged, guided=guided, timings=stream.timings)
+            aligned = [align(window, band, ranged=ranged, guided=guided, timings=stream.timings)]
             if band is bands[-1]:
                 window = None  # frees its composed flows while the denoiser runs
             stream.keeper.trim()
-            denoised = self.denoise(aligned)
-            outliers += aligned.outliers
+            outliers += aligned[0].outliers
+            neighbours, inner = aligned[0].neighbours, aligned[0].inner
+            # No reference stays here: a network frees what it has read before it runs.
+            denoised = self.denoise(aligned.pop())
             named: dict[tuple[str, str], NDArray[Any] | None]
-            named = {("color", ""): denoised.color, ("drift", ""): aligned.neighbours.drift_weight}
+            named = {("color", ""): denoised.color, ("drift", ""): neighbours.drift_weight}
             named |= {("aovs", name): layer for name, layer in denoised.aovs.items()}
             named |= {("extra", name): layer for name, layer in denoised.extra.items()}
-            groups = aligned.neighbours.samples, *aligned.neighbours.geometry
+            groups = neighbours.samples, *neighbours.geometry
             for kind, group in zip(("sides", *NEIGHBOURS), groups, strict=True):
                 named |= {} if group is None else {(kind, name): layer for name, layer in group._asdict().items()}
-            layers.add(band, aligned.inner, named)
+            layers.add(band, inner, named)
             parts = denoised.parts
-            del aligned, denoised, named  # before the next band is aligned
+            del neighbours, denoised, named  # before the next band is aligned
             stream.keeper.trim()
         samples = layers.named("sides")
         color = layers.named("color")[""]
@@ -297,7 +299,7 @@ class FrameDenoiser:
                     fresh = counted if moving is None else counted & ~moving[1]
                     sides = sides._replace(nearest=sides.nearest * fresh)
                 # Noise that the albedo shares with the color is none of their quotient.
-                albedo = frame.albedo if frame.demodulated and "prefilter" not in result.plan.stages else None
+                albedo = frame.albedo if frame.demodulated and not result.plan.noisy_guides else None
                 color = blend_samples(color, noisy, sides, exposure, frame.radiance_variance, albedo)
         color = limit_lamps(color, shown, exposure)
         if moving is not None:

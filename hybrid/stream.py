@@ -71,7 +71,8 @@ class FirstPass:
 class FrameStream:
     """The frames of a shot, read lazily, and the values computed from each, once; `refine` as `refine_flow`.
 
-    `filter_guides` maps a frame's albedo and normal to the same without noise, for denoisers that need them.
+    `filter_guides` maps a frame's albedo and normal to the same without noise, for denoisers that need them; without
+    `reads_guides` the denoiser averages first passes and reads no guides.
     """
 
     def __init__(
@@ -83,6 +84,7 @@ class FrameStream:
         radius: int = RADIUS,
         refine: Callable[..., Array] = refine_flow,
         filter_guides: GuideFilter | None = None,
+        reads_guides: bool = True,
         timings: Timings | None = None,
         keeper: Keeper | None = None,
     ) -> None:
@@ -92,7 +94,7 @@ class FrameStream:
         self.radius = radius
         self.timings = timings or Timings()
         self.keeper = keeper or Keeper()
-        self._refine, self._filter_guides = refine, filter_guides
+        self._refine, self._filter_guides, self._reads_guides = refine, filter_guides, reads_guides
         # Kind of a value and the frames it belongs to → the value.
         self._cache: dict[tuple[str, tuple[int, ...]], object] = {}
 
@@ -169,9 +171,10 @@ class FrameStream:
             f"plan {context}", tuple(numbers), lambda *n: self.rules.decide(*self.measurements(n), context)
         )
 
-    def context(self, first_pass: bool, radius: int) -> Context:
-        """Describe a window of this stream to `plan`."""
-        return Context(first_pass, radius, filters_guides=self._filter_guides is not None)
+    def context(self, number: int, first_pass: bool, radius: int) -> Context:
+        """Describe the window of a frame to `plan`."""
+        reads_guides = self._reads_guides or bool(self._there(number).aovs)
+        return Context(first_pass, radius, self._filter_guides is not None, reads_guides)
 
     def flow(self, start: int, end: int) -> Flow | None:
         """Flow between neighbouring frames; None at a gap or a cut."""
@@ -225,7 +228,7 @@ class FrameStream:
     ) -> Window:
         expect_equal_layers(frames)  # before anything compares them
         middle = len(numbers) // 2
-        plan = self.plan(numbers, self.context(denoised is not None, middle))
+        plan = self.plan(numbers, self.context(number, denoised is not None, middle))
         forth: dict[int, Flow | None] = {}
         back: dict[int, Flow | None] = {}
         samples, own_samples = {number: 1.0}, {number: 1.0}

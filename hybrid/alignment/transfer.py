@@ -1,5 +1,6 @@
 """Transfer curves, each a forward and an inverse function."""
 
+import cv2
 import numpy as np
 
 from hybrid.files.frame import Array
@@ -86,7 +87,7 @@ def _mean_of_lit(radiance: Array) -> float:
     exposure = 0.0
     while lit.any():
         # Lamps, sky in a window and fireflies are few and bright; they must not decide the exposure.
-        levels = level[finite & _in_bins(lit, level.shape)]
+        levels = level.reshape(-1) if lit.all() and finite.all() else level[finite & _in_bins(lit, level.shape)]
         place = len(levels) - 1 - len(levels) // 100
         exposure = float(np.minimum(levels, np.partition(levels, place)[place]).mean(dtype=np.float64))
         still_lit = lit & (means > LIT * exposure)
@@ -123,8 +124,9 @@ def autoexposure(radiance: Array, *, dark: float = BLACK, exposure: float = 1.0)
     ``0.18 / 2^mean(log2 L)``, L the mean luminances above `dark` of bins of at most 16×16 pixels, as in OIDN's
     ``training/color.py``.
     """
-    image = np.maximum(radiance / np.float32(exposure), 0)
-    luminance = image @ np.array([0.212671, 0.715160, 0.072169], np.float32)  # their sum is below 1: none overflows
+    # The sum of the weights is below 1: none overflows.
+    weights = np.array([[0.212671, 0.715160, 0.072169]], np.float32)
+    luminance = cv2.transform(np.maximum(radiance, np.float32(0)), weights) / np.float32(exposure)
     means = _bin_means(luminance, np.isfinite(luminance))
     lit = means[means > dark]
     return float(MIDDLE_GRAY / np.exp2(np.log2(lit).mean())) if lit.size else 1.0
@@ -138,11 +140,15 @@ def _edges(length: int) -> Places:
 
 def _bin_means(layer: Array | Doubles, finite: Mask) -> Doubles:
     """Mean of the finite values of each bin of a layer (H, W), NaN for a bin without."""
-    rows, columns = (_edges(size)[:-1] for size in layer.shape)
-    sums, counts = (
-        np.add.reduceat(np.add.reduceat(part, columns, axis=1, dtype=kind), rows, axis=0)
-        for part, kind in ((np.where(finite, layer, 0), np.float64), (finite, np.intp))
-    )
+    edges = [_edges(size) for size in layer.shape]
+
+    def add(part: Array | Doubles | Mask, kind: type) -> Doubles:
+        sums = np.add.reduceat(np.add.reduceat(part, edges[1][:-1], axis=1, dtype=kind), edges[0][:-1], axis=0)
+        return np.asarray(sums, np.float64)
+
+    if finite.all():
+        return add(layer, np.float64) / np.outer(*map(np.diff, edges))
+    sums, counts = add(np.where(finite, layer, 0), np.float64), add(finite, np.intp)
     return np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0)
 
 

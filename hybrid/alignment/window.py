@@ -238,8 +238,10 @@ class AlignedWindow:
     @property
     def sample_range(self) -> SampleRange:
         """Range of the first passes and the samples of all frames; of windows with a first pass."""
+        if self.known_range is not None:
+            return self.known_range
         assert self.first_pass is not None
-        return self.known_range or find_range(self.first_pass, self.sources.residual_strips())
+        return find_range(self.first_pass, self.sources.residual_strips())
 
     @property
     def middle(self) -> int:

@@ -83,7 +83,7 @@ class WindowSettings:
     vectors: bool = True  # whether the renderer's are read
     solver: Mapping[str, Any] = field(default_factory=dict)  # of TV-L1, which runs then
 
-    def stream(self, shot: Frames, filter_guides: GuideFilter | None = None) -> FrameStream:
+    def stream(self, shot: Frames, filter_guides: GuideFilter | None = None, reads_guides: bool = True) -> FrameStream:
         frames = shot
         if not self.vectors:
             frames = MappedShot(shot, lambda frame: replace(frame, motion=None, motion_convention=None))
@@ -96,7 +96,13 @@ class WindowSettings:
         chosen = named_first_pass(self.source, mode=OIDN_MODE_OF_NETWORKS, backends=backends)
         refine = partial(refine_flow, **self.solver)
         return FrameStream(
-            frames, rules, chosen.first_pass, radius=self.radius, refine=refine, filter_guides=filter_guides
+            frames,
+            rules,
+            chosen.first_pass,
+            radius=self.radius,
+            refine=refine,
+            filter_guides=filter_guides,
+            reads_guides=reads_guides,
         )
 
 
@@ -142,7 +148,7 @@ class Network:
             yield number, window_maps(stream.align(number), lambda window: denoiser(window).color)
 
     def _stream(self, shot: Frames, denoiser: "NetworkDenoiser") -> FrameStream:
-        return replace(self.window, radius=denoiser.radius).stream(shot, denoiser.filter_guides)
+        return replace(self.window, radius=denoiser.radius).stream(shot, denoiser.filter_guides, denoiser.reads_guides)
 
 
 @lru_cache(maxsize=1)

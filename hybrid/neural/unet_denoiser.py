@@ -1,5 +1,6 @@
 """Run the final stage on aligned windows: images from the frames' samples and first passes."""
 
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -43,6 +44,7 @@ class UNetDenoiser(NetworkDenoiser):
     def __init__(self, model: RobustUNet, setup: Setup) -> None:
         super().__init__(for_inference(model, setup.bfloat16), setup, SCRATCH[model.config.size])
         self.clamps = model.backbone is not None  # an average is within the range of what it averages
+        self.reads_guides = model.backbone is not None or setup.breakdown is not None
         self.guided = setup.breakdown is not None or (model.config.clean_guides and not has_oidn_networks())
 
     @property
@@ -56,8 +58,13 @@ class UNetDenoiser(NetworkDenoiser):
             weights = self._weigh(aligned)
             guides = clean_guides(aligned) if self.model.config.clean_guides else aligned.centre.guides
             inputs = _Inputs(self._pool(aligned, weights), guides, weights)
+            if self.setup.breakdown is None:
+                # The samples are pooled: the aligned first passes are freed while the network runs.
+                known_range = aligned.sample_range if self.clamps else None
+                aligned = replace(aligned, first_pass=None, known_range=known_range)
         with self.setup.timings.stage("network"):
             # `measure_exposure` returns 1 for an image without light, as far as numbers go.
+            assert aligned.centre.first_pass is not None
             black = aligned.centre.first_pass.max() < 1 and measure_exposure(aligned.centre.first_pass) == 1
             nothing = np.empty((*aligned.centre.irradiance.shape[:2], 0), np.float32)
             result = self._run(aligned, inputs, nothing, bool(black))

@@ -44,7 +44,7 @@ def test_a_part_is_cut_out_of_the_middle(tmp_path):
 class Fake:
     """A denoiser that calls a function with each window."""
 
-    radius, filter_guides = 1, None
+    radius, filter_guides, reads_guides = 1, None, True
 
     def __init__(self, function):
         self.function = function

@@ -124,11 +124,23 @@ def test_only_a_denoiser_with_a_filter_of_guides_has_them_filtered(shot_folder):
     assert stage.reason.startswith("this denoiser has no filter of guides; forced")
 
 
-def test_noise_in_the_guides_calls_for_prefiltering(tmp_path):
-    def blur(index, layers):
-        noise = np.random.default_rng(index).normal(0, 0.1, layers["ViewLayer.Denoising Albedo"].shape)
-        layers["ViewLayer.Denoising Albedo"] += noise.astype(np.float32)
+def blur(index, layers):
+    noise = np.random.default_rng(index).normal(0, 0.1, layers["ViewLayer.Denoising Albedo"].shape)
+    layers["ViewLayer.Denoising Albedo"] += noise.astype(np.float32)
 
+
+def test_an_average_of_first_passes_has_no_guides_filtered(tmp_path):
+    noisy, average = open_shot(Scene().write(tmp_path, edit=blur)), DENOISED._replace(reads_guides=False)
+    plan = plan_shot(noisy, context=average)
+    assert not decision_of("prefilter", plan).on
+    assert decision_of("prefilter", plan).reason.startswith("the average of denoised frames reads no guides")
+    assert plan.noisy_guides
+    assert decision_of("prefilter", plan_shot(noisy, context=NOISY._replace(reads_guides=False))).on
+    assert decision_of("prefilter", plan_shot(noisy, Rules(on=frozenset({"prefilter"})), context=average)).on
+    assert not plan_shot(open_shot(Scene().write(tmp_path / "sharp")), context=average).noisy_guides
+
+
+def test_noise_in_the_guides_calls_for_prefiltering(tmp_path):
     assert not decisions(Scene().write(tmp_path / "sharp"))["prefilter"].on
     found = decisions(Scene().write(tmp_path / "noisy", edit=blur))
     assert found["prefilter"].on

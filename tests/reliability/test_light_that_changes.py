@@ -151,10 +151,12 @@ CASES: dict[str, tuple[Scene, Edit]] = {
 }
 
 
-# Decibels below the input at 1 % of noise, where that is more than one. Lines of a pixel that cross the motion in every
-# patch of pixels, so that vectors are not trusted, which is said; a screen whose light stands still while the picture
-# around it fades; and first passes of `fast` that err by more than such noise where few neighbours show the same.
-BELOW = {
+# Known faults: decibels below the samples by which a frame may lie in place of `WORST`; the test is then an expected
+# failure. Lines of a pixel that cross the motion in every patch of pixels, so that vectors are not trusted, which is
+# stated; a screen whose light stands still while the picture around it fades; and first passes of `fast` that err by
+# more than such noise where few neighbours show the same.
+WORST = 1
+KNOWN = {
     ("emitters of black albedo", "fast"): 16,
     ("emitters of black albedo", "draft"): 16,
     ("a screen in a fade", "draft"): 9,
@@ -164,6 +166,13 @@ BELOW = {
     ("a beam of a pixel", "fast"): 2,
     ("rain", "fast"): 2,
 }
+
+
+def allow(loss: float, bound: float, known: float | None) -> None:
+    """Fail beyond the bound, and beyond that of a known fault; in between it is an expected failure."""
+    assert loss <= (bound if known is None else known)
+    if loss > bound:
+        pytest.xfail(f"a known fault: {loss:.2f} dB, of at most {bound}")
 
 
 def denoised(
@@ -190,10 +199,9 @@ def denoised(
 @pytest.mark.parametrize("preset", ["fast", "draft"])
 @pytest.mark.parametrize("name", CASES)
 def test_no_frame_is_worse_than_its_input(tmp_path: Path, name: str, preset: str) -> None:
+    losses = []
     for number, truth, noisy, made in denoised(tmp_path, name, NOISE, preset):
-        # The dust's 100 lit pixels are as few as the first pass of `fast` errs over.
-        below = 0.2 if (name, preset) == ("dust of 1e-8", "fast") else 0.05
-        assert psnr(made, truth) >= psnr(noisy, truth) - below, number
+        losses.append(psnr(noisy, truth) - psnr(made, truth))
         if not truth.any():
             assert not made.any()
             continue
@@ -201,13 +209,16 @@ def test_no_frame_is_worse_than_its_input(tmp_path: Path, name: str, preset: str
         lit, error = (0.06, 0) if name == "a sun without vectors" else (0.01, NOISE * truth.std() / truth.mean())
         off = made.mean() / truth.mean() - 1
         assert abs(off) < lit + 4 * (error + NOISE) / np.sqrt(np.count_nonzero(truth.any(axis=-1))), number
+    # The dust's 100 lit pixels are as few as the first pass of `fast` errs over.
+    allow(max(losses), 0.05, 0.2 if (name, preset) == ("dust of 1e-8", "fast") else None)
 
 
 @pytest.mark.parametrize("preset", ["fast", "draft"])
 @pytest.mark.parametrize("name", CASES)
 def test_next_to_no_noise_costs_no_frame_a_decibel(tmp_path: Path, name: str, preset: str) -> None:
-    for number, truth, noisy, made in denoised(tmp_path, name, 0.01, preset):
-        assert psnr(made, truth) >= psnr(noisy, truth) - BELOW.get((name, preset), 1), number
+    frames = denoised(tmp_path, name, 0.01, preset)
+    losses = [psnr(noisy, truth) - psnr(made, truth) for _, truth, noisy, made in frames]
+    allow(max(losses), WORST, KNOWN.get((name, preset)))
 
 
 @pytest.mark.parametrize("tint", [(1, 1, 1), (1, 0.6, 0.3)])
@@ -264,12 +275,15 @@ def test_equal_frames_come_out_equal(tmp_path: Path, preset: str) -> None:
 
         return edit
 
+    least = np.inf
     for fade in (1, 0.8):
         folder = tmp_path / str(fade)
         shot = open_shot(STILL.write(folder / "in", clean=True, edit=equal(fade)))
         frames = sorted(denoise_shot(shot, folder / "out", preset=preset), key=lambda frame: frame.number)
         made = [open_shot(frame.path).read(frame.number).color for frame in frames]
         for index, picture in enumerate(made):
-            assert psnr(picture, STILL.clean(index)[COLOR] * np.float32(fade**index)) > 32.5
+            least = min(least, psnr(picture, STILL.clean(index)[COLOR] * np.float32(fade**index)))
             if fade == 1:
                 np.testing.assert_array_equal(picture, made[0])
+    # `fast` has no U-Net, which removes noise that all frames share.
+    allow(33 - least, 0, 0.5 if preset == "fast" else None)

@@ -116,7 +116,7 @@ def test_a_network_gets_its_guides_filtered_as_in_a_run(shot: Shot, monkeypatch:
 
     class Denoiser:
         radius = 1
-        filter_guides = staticmethod(dict)
+        filter_guides, reads_guides = staticmethod(dict), True
 
         def __call__(self, aligned: AlignedWindow) -> Denoised:
             guided.append(aligned.centre.filtered_guides is not None)

@@ -14,6 +14,7 @@ from hybrid.files.shots import open_shot  # noqa: E402
 from hybrid.first_pass import Classical  # noqa: E402
 from hybrid.neural import open_network, unet_denoiser  # noqa: E402
 from hybrid.neural.unet_denoiser import clean_guides  # noqa: E402
+from hybrid.plan import Rules  # noqa: E402
 from hybrid.pseudo_reference import DRAFT, gated_average  # noqa: E402
 from hybrid.stabilize import Denoised, FrameDenoiser  # noqa: E402
 from hybrid.stream import FrameStream  # noqa: E402
@@ -77,6 +78,32 @@ def test_a_shot_of_few_samples_is_denoised_with_filtered_guides(tmp_path):
         made = list(denoise_view(shot, tmp_path / str(len(stages)), Denoiser(), only(stages), Classical(DRAFT)))
         assert len(made) == SCENE.frames
         assert len(asked) == SCENE.frames * ("clean-guides" in stages)
+
+
+def test_an_average_has_no_noisy_guides_filtered_but_for_aovs(tmp_path):
+    """From the denoiser to the plan: `fast` took 1.08 times the CPU time for an albedo that cancels in its average."""
+    for reads, aovs, expected in ((False, (), False), (False, ("ViewLayer.Env",), True), (True, (), True)):
+
+        class Denoiser:
+            reads_guides, filtered = reads, expected
+
+            def __call__(self, aligned):
+                assert ("prefilter" in aligned.stages) == self.filtered
+                return Denoised(aligned.centre.irradiance * aligned.modulation)
+
+        def blur(index, layers):
+            noise = np.random.default_rng(index).normal(0, 0.1, layers["ViewLayer.Denoising Albedo"].shape)
+            layers["ViewLayer.Denoising Albedo"] += noise.astype(np.float32)
+            layers["ViewLayer.Env"] = 0.1 * layers["ViewLayer.Combined"]
+
+        shot = open_shot(SCENE.write(tmp_path / "in", edit=blur), aovs=aovs)
+        out = tmp_path / f"{reads} {len(aovs)}"
+        made = list(denoise_view(shot, out, Denoiser(), Rules(), Classical(DRAFT)))
+        assert len(made) == SCENE.frames
+
+
+def test_only_a_network_without_a_unet_reads_no_guides():
+    assert [open_network(shipped_weights(name)).reads_guides for name in ("fast", "balanced")] == [False, True]
 
 
 @pytest.mark.parametrize("preset", ["balanced", "quality"])
