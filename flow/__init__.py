@@ -17,13 +17,14 @@ from flow.motion import (
     normalize_motion,
 )
 from flow.patches import FramePair, Patches
+from flow.reflections import find_reflections
 from flow.selection import select_flow
 from flow.tvl1 import dense_flow, refine_flow, rough_flow
 from flow.warp import warp
 
 __all__ = [
     "Choice", "FramePair", "Guide", "GuidePair", "Motion", "MotionConvention", "Patches", "Vectors",
-    "choose_convention", "compose_flow", "dense_flow", "estimate_confidence", "forward_backward_error", "invert_flow",
-    "make_guide", "median_luminance", "mix_centre", "normalize_motion", "pair_guides", "refine_flow", "rough_flow",
-    "select_flow", "tone_map", "warp",
+    "choose_convention", "compose_flow", "dense_flow", "estimate_confidence", "find_reflections",
+    "forward_backward_error", "invert_flow", "make_guide", "median_luminance", "mix_centre", "normalize_motion",
+    "pair_guides", "refine_flow", "rough_flow", "select_flow", "tone_map", "warp",
 ]  # fmt: skip

@@ -22,6 +22,7 @@ STAGES = {
     "warp": "warp neighbouring frames along the motion",
     "dense-flow": "estimate the motion from the pictures by TV-L1",
     "refine": "correct the renderer's vectors by TV-L1",
+    "reflections": "follow reflections and refractions where they move otherwise than their surfaces",
     "fade": "scale neighbouring frames to the light of the centre where a factor of each channel explains the change",
     "gate": "do not average over time where the light itself changes",
     "drift": "average less of denoised frames whose light drifts, as far as samples show",
@@ -44,9 +45,9 @@ WHITEN_ABOVE = 0.13
 # undone in part, 0.07 in frames of 80 pixels; errors of denoised pictures have 0.12 and more.
 WHITEN_BELOW = 0.09
 STILL = 0.05  # motion below a twentieth of a pixel blurs a bilinear sample by less than 1 % of its contrast
-# Share of pixels, in areas of 9×9, whose brightness the vectors do not explain. Refinement is worth its time for
+# Share of pixels, in areas of 9×9, whose brightness the vectors do not explain. To change them is worth its time for
 # reflections and shadows of some size; the gate is cheap and already pays for a small highlight.
-REFINE_ABOVE = 0.01
+UNEXPLAINED_ABOVE = 0.01
 GATE_ABOVE = 0.002
 OUTLIERS_ABOVE = 1e-5  # one firefly in a hundred thousand pixels is twenty in a 1080p frame: visible
 # Upper quartile of |Δalbedo| between frames, along the vectors. Surfaces under film sampling differ by less;
@@ -169,6 +170,8 @@ class Rules:
             # On forty shots and levels `balanced` loses 0.03 dB by it, and `quality` gains 0.01; a sixth of the time.
             why = "denoised frames that vectors misplace do not count (forced, it corrects vectors that are off)"
             on, reason = False, f"{why}; {reason}"
+        if stage == "reflections" and on and not context.first_pass:
+            on, reason = False, f"needs denoised frames; {reason}"
         if stage == "drift" and on and (not context.first_pass or context.radius < 2):
             on, reason = False, f"needs denoised frames, and windows of five or more; {reason}"
         if stage == "prefilter" and on and context.first_pass and not context.reads_guides and not forced:
@@ -215,7 +218,9 @@ def measure_stages(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> 
         _decide("outliers", max(frame.outliers for frame in frames), OUTLIERS_ABOVE, outliers),
         _decide_warp(pairs, vectors, moves, speed, changed),
         _decide_dense_flow(pairs, vectors, moves),
-        _decide_refine(moves, vectors, unexplained),
+        _decide_vectors("refine", vectors, moves, unexplained),
+        # Reflections move on surfaces that stand still, too.
+        _decide_vectors("reflections", vectors, bool(pairs), unexplained),
         _decide("fade", fade, 0, fades),
         _decide("gate", unexplained, GATE_ABOVE, changes),
         # Samples show light that moves by less than the noise of a pixel, which no figure of this plan shows.
@@ -290,12 +295,13 @@ def _decide_dense_flow(pairs: Sequence[PairFacts], vectors: bool, moves: bool) -
     return Decision("dense-flow", moves and not vectors, None, 0, reason)
 
 
-def _decide_refine(moves: bool, vectors: bool, unexplained: float) -> Decision:
+def _decide_vectors(stage: str, vectors: bool, moves: bool, unexplained: float) -> Decision:
+    """Decide a stage that corrects, or adds to, the renderer's vectors."""
     if not vectors:
-        return Decision("refine", False, None, REFINE_ABOVE, "no vectors to refine; see dense-flow")
+        return Decision(stage, False, None, UNEXPLAINED_ABOVE, "no vectors in the file; see dense-flow")
     if not moves:
-        return Decision("refine", False, None, REFINE_ABOVE, "nothing moves")
-    return _decide("refine", unexplained, REFINE_ABOVE, "the vectors leave {:.2%} of the picture unexplained")
+        return Decision(stage, False, None, UNEXPLAINED_ABOVE, "nothing moves")
+    return _decide(stage, unexplained, UNEXPLAINED_ABOVE, "the vectors leave {:.2%} of the picture unexplained")
 
 
 def _decide_fixed_noise(figures: Sequence[float]) -> Decision:

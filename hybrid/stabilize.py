@@ -83,6 +83,7 @@ class WindowResult:
     neighbour_samples: SampleMean | None
     geometry: tuple[Geometry | None, ...]  # of the frames before and after; empty of `as_neighbour`
     drift_weight: Array | None  # (H, W): as `hybrid.alignment.window.Neighbours.drift_weight`
+    reflections: Array | None  # (H, W, 2): as `hybrid.alignment.window.Window.reflections`
     exposure: float  # of the centre's irradiance as rendered, or of the nearest frame with light
     brightest: float  # the greatest mean radiance of the frames of the window
     excess: Excess | None  # of the centre; with "blend-samples"
@@ -92,7 +93,7 @@ class WindowResult:
     def as_neighbour(self) -> Self:
         """The result without the fields that only the average of its own frame reads."""
         alone = Denoised(self.denoised.color)
-        return replace(self, denoised=alone, neighbour_samples=None, geometry=(), drift_weight=None)
+        return replace(self, denoised=alone, neighbour_samples=None, geometry=(), drift_weight=None, reflections=None)
 
 
 @dataclass(frozen=True)
@@ -200,8 +201,10 @@ class FrameDenoiser:
         for frame in window.frames:
             brightest = brightest if frame is None else max(brightest, frame.mean)
             stream.keeper.release()  # a mean reads the whole frame
-        exposure, bands = window.lit.as_rendered.exposure, self._bands()
+        exposure, reflections, bands = window.lit.as_rendered.exposure, window.reflections, self._bands()
         shares = {"refine": float(np.mean(window.refined))} if window.refined else {}
+        if reflections is not None:
+            shares["reflections"] = float(reflections.any(axis=-1).mean())
         layers = _Layers(stream.shot.shape, stream.keeper.empty)
         outliers = 0
         stream.keeper.trim()
@@ -241,6 +244,7 @@ class FrameDenoiser:
             SampleMean(**samples) if samples else None,
             tuple(Geometry(**geometry) if (geometry := layers.named(side)) else None for side in NEIGHBOURS),
             layers.named("drift").get(""),
+            reflections,
             exposure,
             brightest,
             excess,
@@ -254,7 +258,7 @@ class FrameDenoiser:
         geometry, exposure = result.geometry, result.exposure
         colors = {n: other.denoised.color for n, other in self._results.items()}
         self.stream.keeper.trim()
-        window = self.stream.window_of_results(number, colors)
+        window = replace(self.stream.window_of_results(number, colors), reflections=result.reflections)
         color = np.empty_like(result.denoised.color)
         with timings.stage("stabilize"):
             stillness = measure_stillness(result.drift_weight, color.shape[:2])

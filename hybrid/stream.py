@@ -11,6 +11,7 @@ from typing import ClassVar, TypeVar, cast
 
 import numpy as np
 
+from flow.reflections import find_reflections
 from flow.tvl1 import refine_flow
 from hybrid.alignment.align import align, expect_equal_layers
 from hybrid.alignment.fireflies import REACH, remove_fireflies
@@ -35,6 +36,7 @@ from hybrid.alignment.measure import (
 )
 from hybrid.alignment.prepare import PreparedFrame, prepare, prepared_planes, without_filter
 from hybrid.alignment.residual import Limited, measure_limited
+from hybrid.alignment.transfer import measure_exposure
 from hybrid.alignment.unfiltered import find_region, mirror_region
 from hybrid.alignment.window import AlignedWindow, Window
 from hybrid.files.frame import Array, Frame, Frames
@@ -201,7 +203,18 @@ class FrameStream:
             return window
         limits = [(self._limited(n), np.mean(self._fade(n, number, window.stages), dtype=np.float32)) for n in numbers]
         limited = (part and part._replace(exposure=part.exposure * fade) for part, fade in limits)
-        return replace(window, limited=tuple(limited), filtered_guides=self._filtered(numbers, window.stages))
+        window = replace(window, limited=tuple(limited), filtered_guides=self._filtered(numbers, window.stages))
+        return window if "reflections" not in window.stages else self._with_reflections(window)
+
+    def _with_reflections(self, window: Window) -> Window:
+        """The window with the motion of reflections, which its first passes show."""
+        pictures = window.first_pass
+        if pictures is None or (middle := pictures[len(pictures) // 2]) is None:
+            return window
+        flows = [None if link is None else link.forward.vectors for link in window.links]
+        with self.timings.stage("reflections"):
+            motion = find_reflections(pictures, flows, measure_exposure(middle))
+        return window if motion is None else replace(window, reflections=self.keeper.keep(motion))
 
     def window_of_results(self, number: int, results: dict[int, Array]) -> Window:
         """The window of a frame and its two neighbours, with these results (H, W, 3) in the place of a first pass."""
@@ -470,7 +483,8 @@ def _flow_planes(layers: Layers, stages: Collection[str], frames: int, radius: i
     kept = can_refine(stages) or (layers.motion_convention is not None and not layers.motion_convention.pair)
     steps = 2 * (frames - 1) if kept else 0  # the renderer's own are kept with the frames
     composed = 2 * (radius + 1) * max(radius - 1, 0)
-    return (2 + 0.25) * (composed + steps)
+    reflections = 4.0 if "reflections" in stages else 0.0  # the motion of a window, and that of its result
+    return (2 + 0.25) * (composed + steps) + reflections
 
 
 def can_refine(stages: Collection[str]) -> bool:

@@ -28,6 +28,8 @@ FORMAT = "ravg-network"
 #: averaged features of the frames.
 VERSION = 5
 READ = ("3", "4", "5")
+#: Folders of the weights of presets, and of the paper's networks.
+SHIPPED, RESEARCH = Path(__file__).parent / "weights", Path(__file__).parent / "paper" / "weights"
 #: The greatest weight that is read: a thousand times that of any network here. Greater weights give NaN images.
 HEAVIEST = 5e3
 #: Bounds of numbers in a description: two to four times those of any network here. And of all others.
@@ -206,17 +208,16 @@ def find_weights(name: str) -> Path:
     """Path of a file of weights, or of those of a preset, ``ra`` or ``tkpcn``; ValueError for another name."""
     if Path(name).suffix:
         return Path(name)
-    path = Path(__file__).parent / "paper" / "weights" / f"{name}.safetensors"
+    path = RESEARCH / f"{name}.safetensors"
     return path if path.is_file() else shipped_weights(name)
 
 
 def shipped_weights(preset: str) -> Path:
     """Path of the weights of a preset that ships; ValueError, with the names of those that ship, for any other."""
-    folder = Path(__file__).parent / "weights"
-    path = folder / f"{preset}.safetensors"
+    path = SHIPPED / f"{preset}.safetensors"
     if path.is_file():
         return path
-    if (folder.parent / "paper" / "weights" / f"{preset}.safetensors").is_file():
+    if (RESEARCH / path.name).is_file():
         raise ValueError(f"preset is {preset!r}, a network for research, expected --weights {preset}")
-    shipped = ", ".join(sorted(p.stem for p in folder.glob("*.safetensors"))) or "none"
+    shipped = ", ".join(sorted(p.stem for p in SHIPPED.glob("*.safetensors"))) or "none"
     raise ValueError(f"preset is {preset!r}, expected one of: {shipped}")

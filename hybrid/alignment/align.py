@@ -292,6 +292,7 @@ def _align_by_geometry(
     guides = {name: guide[rows] for name, guide in layers.items() if guide is not None}
     confidence, coverage = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     geometry: list[Geometry | None] = [None] * count
+    light_flows = [window.light_flow(index, rows) for index in range(count)]
     with timings.stage("confidence"):
         noise = None
         if any(window.outline_noise):
@@ -305,15 +306,18 @@ def _align_by_geometry(
                 confidence[index] = coverage[index] = centre.valid[rows]
             continue
         with timings.stage("warp"):
+            flow = light_flows[index]
+            assert flow is not None
             for out, layer in zip(warped, layers_of(frame), strict=True):
-                warp_rows(layer, link.forward.vectors[rows], rows.start, out[index])
+                warp_rows(layer, flow, rows.start, out[index])
             coverage[index], confidence[index] = geometry[index] = confidence_by_geometry(
                 guides, frame, link, rows, noise
             )
             _count_own_samples(window, index, rows, coverage[index], confidence[index])
         window.release()
     flows = [None if link is None else link.forward.vectors[rows] for link in window.links]
-    sources = WarpSources(window.frames, flows, window.first_pass or (), window.limited, rows, release=window.release)
+    given = window.frames, flows, light_flows, window.first_pass or (), window.limited, rows
+    sources = WarpSources(*given, release=window.release)
     modulation, clean_albedo = np.ones((*shape[1:], 3), np.float32), None
     with timings.stage("confidence"):
         if "albedo" in guides:
@@ -368,14 +372,14 @@ def _warp_first_pass(
     weights: list[Array | None] = [None] * len(first_pass)
     noise = measure_noise(window.centre.radiance[rows], middle[rows]) if weigh else None
     for index, (picture, link) in enumerate(zip(first_pass, window.links, strict=True)):
-        if link is None or picture is None:
+        flow = window.light_flow(index, rows)
+        if link is None or flow is None or picture is None:
             warped[index] = middle[rows]
             if link is not None:
                 coverage[index] = 0
             continue
         with timings.stage("warp"):
             # Denoised frames have detail to lose and no noise to average: bicubic interpolation gains up to 0.5 dB.
-            flow = link.forward.vectors[rows]
             warp_rows(picture, flow, rows.start, warped[index], interpolation="bicubic")
             if noise is not None and link.forward.vectors.any():
                 bilinear, _ = warp(picture, flow, first_row=rows.start)

@@ -44,6 +44,8 @@ class Window:
     filtered_guides: tuple[Mapping[str, Array] | None, ...] | None = None
     limited: tuple[Limited | None, ...] = ()  # light lost by the limit of residuals in each frame with a first pass
     release: Callable[[], None] = _nothing  # called when a frame has been read (`hybrid.runtime.kept.Keeper.release`)
+    # (H, W, 2): pixels a frame that light moves by beside the links (`flow.reflections`); None: nowhere
+    reflections: Array | None = None
 
     @property
     def centre(self) -> PreparedFrame:
@@ -51,6 +53,14 @@ class Window:
         frame = self.frames[len(self.frames) // 2]
         assert frame is not None
         return frame
+
+    def light_flow(self, index: int, rows: slice) -> Array | None:
+        """The flow of light (h, W, 2) from rows of the centre to a frame; None without a link."""
+        link = self.links[index]
+        if link is None:
+            return None
+        flow = link.forward.vectors[rows]
+        return flow if self.reflections is None else flow + (index - len(self.frames) // 2) * self.reflections[rows]
 
     @property
     def lit(self) -> PreparedFrame:
@@ -74,6 +84,8 @@ class WarpSources:
     frames: Sequence[PreparedFrame | None]  # in order
     # (h, W, 2), from these rows of the centre to each; None for the centre and where there is none
     flows: Sequence[Array | None]
+    # the same of light, which differ where reflections move otherwise than their surface
+    light_flows: Sequence[Array | None]
     first_pass: Sequence[Array | None]  # (H, W, 3): denoised radiance of each frame; empty without a first pass
     limited: Sequence[Limited | None]  # as `Window.limited`
     rows: slice  # of the centre
@@ -85,7 +97,8 @@ class WarpSources:
         """Warp a layer of all frames, (T, h, W, 3), to rows of the centre, or all; its own where there is no flow."""
         first = self.rows.start + part.indices(len(centre_layer))[0]
         window = np.empty((len(self.frames), *centre_layer[part].shape), np.float32)
-        for frame, flow, out in zip(self.frames, self.flows, window, strict=True):
+        flows = self.flows if name in ("albedo", "normal") else self.light_flows
+        for frame, flow, out in zip(self.frames, flows, window, strict=True):
             if frame is None or flow is None:
                 out[...] = centre_layer[part]
             else:
@@ -109,7 +122,7 @@ class WarpSources:
         (top, bottom, _), (left, right, _) = (s.indices(size) for s, size in zip(part, self.shape, strict=True))
         residuals = np.empty((len(self.frames), bottom - top, right - left, 3), np.float32)
         limits = self.limited if limited else len(self.frames) * (None,)
-        sources = zip(self.frames, self.first_pass, self.flows, limits, residuals, strict=True)
+        sources = zip(self.frames, self.first_pass, self.light_flows, limits, residuals, strict=True)
         for frame, denoised, flow, limit, out in sources:
             if frame is None or denoised is None:
                 out[:] = 0
