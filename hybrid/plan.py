@@ -26,7 +26,7 @@ STAGES = {
     "fade": "scale neighbouring frames to the light of the centre where a factor of each channel explains the change",
     "gate": "do not average over time where the light itself changes",
     "drift": "average less of denoised frames whose light drifts, as far as samples show",
-    "fixed-noise": "do not average noise that stands still on the screen",
+    "fixed-noise": "do not average noise that stands still on the screen: average denoised frames alone",
     "prefilter": "filter noisy albedo and normals before they guide anything",
     "clean-guides": "filter albedo and normals for networks that need them without noise, and average them over time",
     "stabilize": "average each result with those of the neighbouring frames",
@@ -310,7 +310,7 @@ def _decide_fixed_noise(figures: Sequence[float]) -> Decision:
     figure = float(np.median(figures))
     reason = "{:.2f} of the noise of neighbouring frames is the same at equal pixels"
     if figure > FIXED_NOISE_ABOVE:
-        reason += ": the render has one seed for all frames, and time adds little where nothing moves; in Blender, "
+        reason += ": the render has one seed for all frames: samples of neighbours add nothing; in Blender, "
         reason += "switch on Render > Sampling > Advanced > Animate Seed (the clock beside Seed)"
     return _decide("fixed-noise", figure, FIXED_NOISE_ABOVE, reason)
 

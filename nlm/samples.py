@@ -5,7 +5,7 @@ of a window show where, as samples of one frame are independent of those of anot
 """
 
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -99,6 +99,11 @@ class SampleMean(NamedTuple):
     trust: Floats  # (H, W) in [0, 1]: 1 where the confidence of all frames adds up to 1
     nearest: Floats  # (H, W) variance of the centre, summed over channels, by the second nearest neighbour
 
+    @classmethod
+    def unknown(cls, shape: tuple[int, ...]) -> Self:
+        """No samples for a frame (H, W, 3): no neighbour is trusted."""
+        return cls(np.zeros(shape, np.float32), *np.zeros((3, *shape[:2]), np.float32))
+
 
 def average_neighbours(
     estimates: Floats,
@@ -122,8 +127,8 @@ def average_neighbours(
     """
     estimates, confidence = check_window(estimates, confidence, "confidence")
     check_colors(noisy, estimates)
-    shape, noisy = estimates.shape[1:], np.ascontiguousarray(noisy, np.float32)
-    mean = SampleMean(np.zeros(shape, np.float32), *np.zeros((3, *shape[:2]), np.float32))
+    noisy = np.ascontiguousarray(noisy, np.float32)
+    mean = SampleMean.unknown(estimates.shape[1:])
     for top, strip in [(0, estimates)] if residuals is None else residuals:
         check_strip(strip, estimates, top)
         given = estimates, np.ascontiguousarray(strip, np.float32), residuals is not None

@@ -20,6 +20,7 @@ from hybrid.alignment.window import (
     WarpSources,
     Window,
     clean_guide,
+    moves_over_noise,
     warp_rows,
 )
 from hybrid.files.frame import Array
@@ -31,7 +32,7 @@ from nlm.gate import agreement_weight, color_gate, color_gates
 from nlm.interpolation import interpolation_weight, measure_noise
 from nlm.pooling import SampleRange
 from nlm.relight import relight
-from nlm.samples import average_neighbours
+from nlm.samples import SampleMean, average_neighbours
 
 # Scale of the gate of results, relative to a frame's noise: everywhere, and where the light stands still (`nlm.drift`)
 # and the mean difference is subtracted (`nlm.relight`). With the second alone results are steadier by 0.2 dB, and
@@ -167,12 +168,15 @@ def _align_denoised(
             before, after = window.links[middle - 2 : middle], window.links[middle + 1 : middle + 3]
             if None not in before or None not in after:  # two frames on one side show drift
                 drift_weight = pull[middle + 1].copy()  # a view would keep the weights of all frames in memory
-        if "blend-samples" in stages:
+        if "blend-samples" in stages and moves_over_noise(stages):
+            # Noise that frames share would pass for detail: 6 to 12 dB of a slow pan.
+            samples = SampleMean.unknown(irradiance.shape)
+        elif "blend-samples" in stages:
             known_range = SampleRange.empty(irradiance.shape) if ranged else None
             strips = _pull_behind(sources.residual_strips(), estimates, confidence, pull, known_range)
             noisy = window.centre.radiance[rows]
             samples = average_neighbours(estimates, strips, confidence, aligned.confidence, aligned.modulation, noisy)
-        elif pull is not None:
+        if pull is not None and (samples is None or moves_over_noise(stages)):
             pull_to_centre(estimates, confidence, pull)
     return replace(
         aligned,
@@ -345,7 +349,9 @@ def _count_own_samples(window: Window, index: int, rows: slice, coverage: Array,
     """Reduce the coverage and the confidence (h, W) of a neighbour, in place, to what its samples add to the centre."""
     link = window.links[index]
     factors: list[Array | np.float32] = [window.own_samples[index]]
-    if "fixed-noise" in window.stages and link is not None:
+    # Along a motion the errors of denoised frames differ, though the noise stands still.
+    averaged = window.first_pass is not None and moves_over_noise(window.stages)
+    if "fixed-noise" in window.stages and link is not None and not averaged:
         factors.append(novelty_of(link.forward.vectors[rows]))
     for factor in factors:
         coverage *= factor

@@ -9,7 +9,7 @@ import torch
 
 from hybrid.alignment.guides import GuideFilter
 from hybrid.alignment.transfer import measure_exposure, measure_gain
-from hybrid.alignment.window import AlignedWindow
+from hybrid.alignment.window import AlignedWindow, moves_over_noise
 from hybrid.files.frame import Array
 from hybrid.neural.aovs import filter_aovs, share_out
 from hybrid.neural.network_denoiser import NetworkDenoiser, Setup, Tile, exposure_of
@@ -43,7 +43,7 @@ class UNetDenoiser(NetworkDenoiser):
 
     def __init__(self, model: RobustUNet, setup: Setup) -> None:
         super().__init__(for_inference(model, setup.bfloat16), setup, SCRATCH[model.config.size])
-        self.clamps = model.backbone is not None  # an average is within the range of what it averages
+        self.clamps = model.backbone is not None
         self.reads_guides = model.backbone is not None or setup.breakdown is not None
         self.guided = setup.breakdown is not None or (model.config.clean_guides and not has_oidn_networks())
 
@@ -58,9 +58,10 @@ class UNetDenoiser(NetworkDenoiser):
             weights = self._weigh(aligned)
             guides = clean_guides(aligned) if self.model.config.clean_guides else aligned.centre.guides
             inputs = _Inputs(self._pool(aligned, weights), guides, weights)
+            clamps = self._pools(aligned)  # an average is within the range of what it averages
             if self.setup.breakdown is None:
                 # The samples are pooled: the aligned first passes are freed while the network runs.
-                known_range = aligned.sample_range if self.clamps else None
+                known_range = aligned.sample_range if clamps else None
                 aligned = replace(aligned, first_pass=None, known_range=known_range)
         with self.setup.timings.stage("network"):
             # `measure_exposure` returns 1 for an image without light, as far as numbers go.
@@ -68,11 +69,15 @@ class UNetDenoiser(NetworkDenoiser):
             black = aligned.centre.first_pass.max() < 1 and measure_exposure(aligned.centre.first_pass) == 1
             nothing = np.empty((*aligned.centre.irradiance.shape[:2], 0), np.float32)
             result = self._run(aligned, inputs, nothing, bool(black))
-            if self.clamps:
+            if clamps:
                 result = result._replace(irradiance=clamp_to_range(result.irradiance, aligned.sample_range))
             filtered = filter_aovs(aligned, result.irradiance)
             shared = share_out(aligned, filtered, result.irradiance, add=self.setup.add_layers)
             return Denoised(shared.color, shared.aovs, self._count_parts(aligned, result), shared.parts)
+
+    def _pools(self, aligned: AlignedWindow) -> bool:
+        """Whether samples are pooled for a U-Net; else the result is the average of the first passes."""
+        return self.model.backbone is not None and not moves_over_noise(aligned.stages)
 
     def _weigh(self, aligned: AlignedWindow) -> Array:
         """Weights (T, H, W) of the frames, from the Robust Average block."""
@@ -83,8 +88,8 @@ class UNetDenoiser(NetworkDenoiser):
         return np.ascontiguousarray(weights[0, :, 0].float().cpu().numpy())
 
     def _pool(self, aligned: AlignedWindow, weights: Array) -> PooledSamples:
-        """The pooled samples; without a U-Net the average of the first passes, which is the image then."""
-        if self.model.backbone is not None:
+        """The pooled samples, or in their place the average of the first passes, which is the image then."""
+        if self._pools(aligned):
             return aligned.pool(weights)
         assert aligned.first_pass is not None
         mean = average(aligned.first_pass, weights)
@@ -100,13 +105,16 @@ class UNetDenoiser(NetworkDenoiser):
         borders: Borders = border(outer[0], height), border(outer[1], width)
         layers = (*window.pooled[::-1], aligned.modulation, *(window.guides.get(n) for n in ("albedo", "normal")))
         gain = gain_of(aligned).to(self.setup.torch_device)
-        image = self.model.denoise(*(self._cut(layer, outer) for layer in layers), gain, borders)
+        if self._pools(aligned):
+            image = self.model.denoise(*(self._cut(layer, outer) for layer in layers), gain, borders)
+        else:
+            image = tensor_of(window.pooled.average[None, *outer])[:, 0].clamp_min(0)
         return Tile(image, None, partial(self._parts, aligned, window.weights, outer))
 
     def _parts(self, aligned: AlignedWindow, weights: Array, outer: Block) -> tuple[torch.Tensor, torch.Tensor]:
         """Contribution and share of each frame within a tile, as `NetworkDenoiser` counts them."""
         window = self._window(aligned, outer)
-        if self.model.backbone is None:
+        if not self._pools(aligned):
             window = window._replace(residual=torch.zeros_like(window.residual))
         pooled = pool(window, self._cut_window(weights[..., None], outer))
         return pooled.parts, pooled.share

@@ -214,6 +214,21 @@ def test_noise_that_stands_still_is_told_from_detail(samples, step, fixed, vecto
     assert found > 0.6 if fixed else abs(found) < 0.15
 
 
+@pytest.mark.parametrize("shared", [0, 0.5, 0.9])
+def test_noise_that_a_slow_pan_shares_in_part_is_found(shared):
+    """With one seed the samples of a pixel follow nearly the same paths: no value is equal, but half of the noise."""
+    scene = Scene(height=96, width=128, step=(1, 0))
+
+    def frame(index):
+        common, own = (np.random.default_rng(seed).normal(size=(96, 128, 1)) for seed in (5, 6 + index))
+        grain = np.exp(0.4 * (np.sqrt(shared) * common + np.sqrt(1 - shared) * own))
+        layers = scene.clean(index)
+        return prepare(hard_frame(layers, layers["ViewLayer.Combined"] * grain, index))
+
+    found = fixed_noise(frame(0), frame(1), moves=True)
+    assert found == pytest.approx(shared, abs=0.1)
+
+
 def hard_frame(layers, color, index):
     from flow.motion import CYCLES
     from hybrid.files.frame import Frame
