@@ -244,11 +244,13 @@ class AlignedWindow:
     def pool(self, weight: Array | None = None) -> PooledSamples:
         """Average the samples of all frames at the centre, by weights (T, H, W) or the confidence; irradiance.
 
-        Raises ValueError without a first pass.
+        Over noise that stands still those of the centre alone. Raises ValueError without a first pass.
         """
         if self.first_pass is None:
             raise ValueError("aligned: expected a window with estimates, got none")
         weight = self.confidence if weight is None else weight
+        if moves_over_noise(self.stages):
+            weight = weight * (np.arange(len(weight)) == self.middle)[:, None, None]
         pooled = PooledSamples(*(np.empty_like(self.centre.irradiance) for _ in PooledSamples._fields))
         for top, residual in self.sources.residual_strips(limited=True):
             rows = slice(top, top + residual.shape[1])

@@ -1,6 +1,7 @@
 """The preset "gathered": samples meet along the motion, and are denoised once more."""
 
 import importlib.util
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -86,6 +87,17 @@ def test_with_one_seed_for_all_frames_nothing_is_gathered_where_nothing_moves(tm
             shot, only(stages), first_pass=PerFrame(lambda f: still.clean(0)["ViewLayer.Combined"])
         ).align(1003)
         np.testing.assert_allclose(np.delete(aligned.confidence, 2, axis=0), weight, atol=1e-3)
+
+
+def test_over_noise_that_stands_still_only_the_centres_samples_are_gathered(tmp_path) -> None:
+    """Copies of the noise that are warped pass for detail."""
+    shot = open_shot(SCENE.write(tmp_path))
+    aligned = FrameStream(shot, only(STAGES | {"fixed-noise"}), first_pass=PerFrame(truth)).align(MIDDLE)
+    assert aligned.confidence[:2].any()
+    pooled = aligned.pool()
+    centre = np.zeros_like(aligned.confidence)
+    centre[2] = aligned.confidence[2]
+    np.testing.assert_allclose(pooled.image, replace(aligned, stages=frozenset()).pool(centre).image, rtol=1e-6)
 
 
 def test_missing_neighbours_bring_nothing(tmp_path) -> None:
