@@ -15,8 +15,8 @@ _SHRINK = 2
 _SIGMA = 4.0
 # Steps, and the deviation, pixels, by which pictures are blurred in each: about as far as a step reaches.
 _STEPS, _BLUR = 3, 2.0
-# Longest motion, pixels a frame.
-_MOST = 4.0
+# Longest motion, pixels a frame; what reaches nearly so far may go on, and does not count.
+_MOST, _REACHED = 4.0, 0.95
 # Motion counts where it leaves less than so much of the squared difference of the frames. With 0.4 the glass ball loses
 # 0.9 dB, with 0.6 it gains 0.1, and a shot of hair and glass loses 0.05 / 0.08.
 _LEFT = 0.5
@@ -70,13 +70,14 @@ def find_reflections(
         return [warp(p, motion * np.float32(t / _SHRINK))[0] for t, p in zip(times, aligned, strict=True)]
 
     def difference(moved: Sequence[Floats]) -> Floats:
-        return sum((_mean(np.square(picture - centre)) for picture in moved), np.zeros_like(centre))
+        return sum((np.square(picture - centre) for picture in moved), np.zeros_like(centre))
 
     motion = np.zeros((*centre.shape, 2), np.float32)
     for _ in range(_STEPS):
         motion += _step([*along(motion), centre], [*times, 0])
         motion *= (_MOST / np.maximum(np.hypot(motion[..., 0], motion[..., 1]), _MOST))[..., None]
-    counts = difference(along(motion)) < _LEFT * difference(aligned)
+    counts = _mean(difference(along(motion))) < _LEFT * _mean(difference(aligned))
+    counts &= np.hypot(motion[..., 0], motion[..., 1]) < _REACHED * _MOST
     if not counts.any():
         return None
     motion = np.where(counts[..., None], motion, np.float32(0))

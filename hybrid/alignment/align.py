@@ -144,6 +144,11 @@ def _align_denoised(
         with timings.stage("confidence"):
             filtered_guides = average_guides(window.filtered_guides, sources.flows, aligned.confidence, rows)
     estimates, interpolation = _warp_first_pass(window, first_pass, coverage, rows, timings)
+    plain = None
+    if window.reflections is not None and "blend-samples" in stages and not moves_over_noise(stages):
+        along_surfaces = replace(window, reflections=None)
+        plain, _ = _warp_first_pass(along_surfaces, first_pass, coverage, rows, timings, weigh=False)
+        plain /= aligned.modulation
     with timings.stage("confidence"):
         pictures, complete = [estimates, *aligned.aovs.values()], aligned.confidence[middle].all()
         if not complete:
@@ -171,12 +176,19 @@ def _align_denoised(
         if "blend-samples" in stages and moves_over_noise(stages):
             # Noise that frames share would pass for detail: 6 to 12 dB of a slow pan.
             samples = SampleMean.unknown(irradiance.shape)
+        elif "blend-samples" in stages and plain is not None:
+            # With next to no noise samples are right where the motion that was found is wrong.
+            strips = replace(sources, light_flows=sources.flows).residual_strips()
+            noisy = window.centre.radiance[rows]
+            assert window.reflections is not None
+            light = confidence * ~window.reflections[rows].any(axis=-1)  # that of the shifted frames says nothing here
+            samples = average_neighbours(plain, strips, light, aligned.confidence, aligned.modulation, noisy)
         elif "blend-samples" in stages:
             known_range = SampleRange.empty(irradiance.shape) if ranged else None
             strips = _pull_behind(sources.residual_strips(), estimates, confidence, pull, known_range)
             noisy = window.centre.radiance[rows]
             samples = average_neighbours(estimates, strips, confidence, aligned.confidence, aligned.modulation, noisy)
-        if pull is not None and (samples is None or moves_over_noise(stages)):
+        if pull is not None and (samples is None or moves_over_noise(stages) or plain is not None):
             pull_to_centre(estimates, confidence, pull)
     return replace(
         aligned,
@@ -390,6 +402,15 @@ def _warp_first_pass(
             if noise is not None and link.forward.vectors.any():
                 bilinear, _ = warp(picture, flow, first_row=rows.start)
                 weights[index] = interpolation_weight(warped[index], bilinear, noise)
+            if noise is not None and window.reflections is not None:
+                # Motion that was found may be wrong where vectors are right, as at outlines.
+                found, errs = (
+                    window.reflections[rows].any(axis=-1),
+                    interpolation_weight(warped[index], middle[rows], noise),
+                )
+                weights[index] = np.where(found, errs, np.float32(1)) * (
+                    1 if weights[index] is None else weights[index]
+                )
             fill_uncovered(warped[index], middle[rows], coverage[index])
         window.release()
     return warped, weights
