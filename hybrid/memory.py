@@ -100,6 +100,9 @@ def plan_memory(
     # A first pass made of windows is filtered beside a network too.
     filtered = not neural or (first_pass is not None and first_pass.from_noisy)
     worked, aligned = _worked_planes(layers, 2 * radius + 1, filtered)
+    if "reflections" in stages and first_pass is not None:
+        # The flows of light, and first passes along surfaces beside those along light.
+        aligned += 7.0 * (2 * radius + 1)
     plane = 4 * height * width
     base, code = (BASE_NEURAL, OIDN_NEURAL) if neural else (BASE, OIDN)
     holds = 0 if first_pass is None else first_pass.holds
