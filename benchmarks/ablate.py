@@ -24,14 +24,14 @@ from ladder import Truth, denoise, levels
 
 import hybrid.alignment.align
 import hybrid.alignment.measure
-import hybrid.stabilize
+import hybrid.denoising.stabilize
 import nlm.samples
 
 STAGES = (
     "gate", "drift", "prefilter", "clean-guides", "stabilize", "restore-mean", "blend-samples", "fireflies",
     "demodulate",
 )  # fmt: skip
-align, stabilize, samples = hybrid.alignment.align, hybrid.stabilize, nlm.samples
+align, stabilize, samples = hybrid.alignment.align, hybrid.denoising.stabilize, nlm.samples
 _stillness, _combine, _means = stabilize.measure_stillness, align.combine_confidence, samples._MEANS
 
 

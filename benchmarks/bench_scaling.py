@@ -26,7 +26,7 @@ from pathlib import Path
 
 from bench_shot import measure, write_shot
 
-from hybrid.records import read_records
+from hybrid.run.records import read_records
 
 SCALES = (1, 2, 4, 6, 8, 12)  # times 320×180
 FRAMES = (1, 3, 10, 30, 100, 300)

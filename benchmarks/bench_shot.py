@@ -33,7 +33,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from hybrid.files.exr import read_exr
 from hybrid.files.shots import open_shot, output_path
-from hybrid.records import read_records
+from hybrid.run.records import read_records
 from tests.exr_files import write_layers
 
 SHOT = Path(__file__).parent.parent / "examples" / "shot"
@@ -131,7 +131,7 @@ def write_shot(name: str, folder: Path, frames: int, scale: int) -> str:
 
 
 def run_oidn(pattern: str, out: Path, mode: str) -> None:
-    from hybrid.oidn import denoise_oidn
+    from hybrid.denoising.oidn import denoise_oidn
 
     shot = open_shot(pattern)
     out.mkdir(parents=True, exist_ok=True)

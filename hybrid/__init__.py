@@ -9,16 +9,16 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hybrid.arrays import denoise_arrays
     from hybrid.files.shots import open_shot
-    from hybrid.job import DenoiseOptions, denoise_shot
+    from hybrid.run.arrays import denoise_arrays
+    from hybrid.run.job import DenoiseOptions, denoise_shot
 
 __all__ = ["DenoiseOptions", "denoise_arrays", "denoise_shot", "open_shot"]
 
 _MODULES = {
-    "DenoiseOptions": "hybrid.job",
-    "denoise_arrays": "hybrid.arrays",
-    "denoise_shot": "hybrid.job",
+    "DenoiseOptions": "hybrid.run.job",
+    "denoise_arrays": "hybrid.run.arrays",
+    "denoise_shot": "hybrid.run.job",
     "open_shot": "hybrid.files.shots",
 }
 

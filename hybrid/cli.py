@@ -10,7 +10,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from hybrid.commands.log import LOG, end_log, one_line, start_log, tolerant_streams
-from hybrid.option_texts import TEXTS
+from hybrid.run.option_texts import TEXTS
 from hybrid.runtime.interrupt import INTERRUPTED, is_interrupt, stop_with_stdin
 from hybrid.runtime.system import expand_home
 from hybrid.runtime.threads import check_thread_counts, prepare_libraries

@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hybrid.arrays import denoise_arrays
     from hybrid.files.shots import open_shot
-    from hybrid.job import DenoiseOptions, denoise_shot
+    from hybrid.run.arrays import denoise_arrays
+    from hybrid.run.job import DenoiseOptions, denoise_shot
 
     __version__: str
 

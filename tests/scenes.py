@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from hybrid.denoising.plan import STAGES, Rules
+from hybrid.denoising.stabilize import DenoiseWindow
+from hybrid.denoising.stream import FirstPass
 from hybrid.files.shots import Shot
-from hybrid.pipeline import Failed, Finished, RunSettings, View, denoise_frames
-from hybrid.plan import STAGES, Rules
+from hybrid.run.pipeline import Failed, Finished, RunSettings, View, denoise_frames
 from hybrid.runtime.timing import Timings
-from hybrid.stabilize import DenoiseWindow
-from hybrid.stream import FirstPass
 from tests.exr_files import write_layers
 
 

@@ -141,7 +141,7 @@ def test_beside_a_distribution_with_packages_of_the_same_names(wheel, tmp_path):
     assert call("-m", "ravg", "--version").stdout == f"ravg {VERSION}\n"
     install(theirs)
     assert owners() == "theirs theirs theirs"
-    assert call("-c", "import ravg; print(ravg.denoise_shot.__module__)").stdout == "hybrid.job\n"
+    assert call("-c", "import ravg; print(ravg.denoise_shot.__module__)").stdout == "hybrid.run.job\n"
     pip("uninstall", "-y", "theirs")
     done = call("-m", "ravg", "--version")
     assert (done.returncode, done.stdout) == (1, "")

@@ -14,6 +14,8 @@ import pytest
 ROOT = Path(__file__).parent.parent
 DEVELOPERS = ROOT / "docs" / "dev"
 OURS = {"loops", "flow", "nlm", "network", "hybrid", "ravg"}
+# The pages name modules of `hybrid` from these packages on.
+PREFIXES = ("", "hybrid.", "hybrid.alignment.", "hybrid.checks.", "hybrid.denoising.", "hybrid.run.")
 
 
 @cache
@@ -110,11 +112,11 @@ def test_the_extension_for_blender_imports_blender_and_nothing_else():
 WITHOUT_TESTS_OF_THEIR_OWN = {
     "hybrid/alignment/fireflies.py",
     "hybrid/alignment/prepare.py",
-    "hybrid/breakdown.py",
+    "hybrid/denoising/breakdown.py",
     "hybrid/commands/inspect.py",
     "hybrid/commands/simulate.py",
     "hybrid/commands/status.py",
-    "hybrid/memory.py",
+    "hybrid/run/memory.py",
     "hybrid/simulate/motion.py",
     "hybrid/simulate/random_assets.py",
     "hybrid/simulate/scene_assets.py",
@@ -185,7 +187,7 @@ def test_names_of_the_glossary_exist():
     assert all("`" in cell for cell in cells)
     assert [name for cell in cells for name in re.findall(r"`([\w.]+)`", cell) if not defines(name)] == []
     assert defines("flow")
-    assert not defines("hybrid.plan.NOTHING")
+    assert not defines("hybrid.denoising.plan.NOTHING")
     assert not defines("hybrid.nothing")
 
 
@@ -199,7 +201,7 @@ def test_names_of_the_architecture_exist():
     def known(name: str) -> bool:
         owner, _, member = name.partition(".")
         inside = owner in top and (not member or member in members(top[owner]))
-        return inside or any(defines(f"{prefix}{name}") for prefix in ("", "hybrid.", "hybrid.alignment."))
+        return inside or any(defines(f"{prefix}{name}") for prefix in PREFIXES)
 
     names = re.findall(r"`([A-Za-z_][\w.]*)`", page)
     assert len(names) > 40
@@ -240,7 +242,7 @@ def test_docstrings_name_the_parameters_that_there_are(package):
 def test_functions_that_users_import_document_their_parameters():
     """Shapes of windows, weights and flows stand in `flow` and `nlm` once: few parameters need no section."""
     exported = re.findall(r'"(\w+)"', (ROOT / "ravg" / "__init__.py").read_text(encoding="utf-8").split("__all__")[1])
-    modules = [ROOT / "hybrid" / name for name in ("arrays.py", "job.py", "files/shots.py")]
+    modules = [ROOT / "hybrid" / name for name in ("run/arrays.py", "run/job.py", "files/shots.py")]
     functions = [(2, node) for path in modules for node in public_functions(path) if node.name in exported]
     for package in ("flow", "nlm"):
         exported = re.findall(r'"(\w+)"', (ROOT / package / "__init__.py").read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Measurements of frames and pairs, from which stages are chosen alike in every part of a shot (`hybrid.plan`)."""
+"""Measurements of frames and pairs, from which stages are chosen alike in every part of a shot (`denoising.plan`)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -25,10 +25,10 @@ from hybrid.comparison.running import run_in_process
 from hybrid.comparison.store import FrameStore
 from hybrid.comparison.sweep import CLASSICAL, NETWORK, sweep_methods
 from hybrid.comparison.tables import ladder_rows, ladder_table, markdown_rows, markdown_table, result_table
+from hybrid.denoising.stream import plan_shot
 from hybrid.files.movies import check_movie
 from hybrid.files.shots import Shot, open_matching_sequence
 from hybrid.runtime.allocator import reuse_freed_memory
-from hybrid.stream import plan_shot
 
 FRAMES = "frames"  # folder next to the page
 

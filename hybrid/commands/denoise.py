@@ -15,26 +15,26 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import typer
 
+from hybrid.checks.validation import Finding
 from hybrid.commands import options as opt
 from hybrid.commands import shots
 from hybrid.commands.chunks import Chunk, arguments_of, run_jobs
 from hybrid.commands.cluster import run_on_cluster
 from hybrid.commands.log import LOG, Progress, duration, log_file, one_line, print_table, printable, summarize
+from hybrid.denoising.first_pass import SPECS
+from hybrid.denoising.plan import NEURAL_STAGES, Plan, merge
 from hybrid.files.layers import summarize_layers
 from hybrid.files.profile import ROLE_FACTS
 from hybrid.files.sequences import format_frames
 from hybrid.files.shots import Shot, output_path
-from hybrid.first_pass import SPECS
-from hybrid.job import DenoiseOptions, Job, Paths, Step, check_paths
-from hybrid.memory import parse_size
-from hybrid.pipeline import Failed, Finished
-from hybrid.plan import NEURAL_STAGES, Plan, merge
-from hybrid.preview import check_png, check_preview, write_contact_sheet, write_preview
-from hybrid.records import FOLDER, Record, read_records, record_path, sequence_name
+from hybrid.run.job import DenoiseOptions, Job, Paths, Step, check_paths
+from hybrid.run.memory import parse_size
+from hybrid.run.pipeline import Failed, Finished
+from hybrid.run.preview import check_png, check_preview, write_contact_sheet, write_preview
+from hybrid.run.records import FOLDER, Record, read_records, record_path, sequence_name
 from hybrid.runtime.interrupt import INTERRUPTED, interruptible
 from hybrid.runtime.system import peak_memory
 from hybrid.runtime.timing import Timings
-from hybrid.validation import Finding
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,10 @@ from hybrid.commands.shots import (
     split_stages,
     views_of,
 )
+from hybrid.denoising.plan import STAGES, Decision, Rules
+from hybrid.denoising.stream import plan_shot
 from hybrid.files.layers import describe_layers
-from hybrid.job import validate_views
-from hybrid.plan import STAGES, Decision, Rules
-from hybrid.stream import plan_shot
+from hybrid.run.job import validate_views
 
 
 @opt.command("inspect", opt.ReadOptions)

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_t
 import typer
 
 from hybrid.commands.log import LogFormat, start_log
-from hybrid.option_texts import option_texts
+from hybrid.run.option_texts import option_texts
 
 Thing = TypeVar("Thing")
 Device = Literal["auto", "cpu", "cuda", "hip", "sycl", "metal"]
@@ -49,7 +49,7 @@ class LogOptions:
 def command(name: str, *configs: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Make a function a command: with options for its parameters and for fields of dataclasses, and with a log.
 
-    `hybrid.option_texts` describes the options; a field without an entry is none. The function gets the values of
+    `hybrid.run.option_texts` describes the options; a field without an entry is none. The function gets the values of
     fields by keyword. A function in the `Annotated` of a parameter checks its value.
     """
     texts = option_texts(name)
@@ -109,8 +109,8 @@ def check_output(output: str) -> str:
 
 
 def check_first_pass(spec: str) -> str:
-    """Refuse a first pass as `hybrid.job.check_first_pass`."""
-    from hybrid.job import check_first_pass as check
+    """Refuse a first pass as `hybrid.run.job.check_first_pass`."""
+    from hybrid.run.job import check_first_pass as check
 
     with usage():
         check(spec)

@@ -9,23 +9,23 @@ from typing import Any, TypeVar
 
 import typer
 
+from hybrid.checks.validation import Finding, ValidationReport, find_cut, find_repeat, validate_layers
 from hybrid.commands.log import LOG, printable
 from hybrid.commands.options import ReadOptions, usage
+from hybrid.denoising.plan import Plan
 from hybrid.files.exr import MAX_PIXELS
 from hybrid.files.profile import ROLES, Profile, open_profile, parse_motion
 from hybrid.files.sequences import find_views, name_view, parse_frames
 from hybrid.files.shots import Shot, open_shot
 from hybrid.files.sidecars import names_sequence
-from hybrid.job import import_neural as import_torch
-from hybrid.plan import Plan
+from hybrid.run.job import import_neural as import_torch
 from hybrid.runtime.first_run import watch_compiling
-from hybrid.validation import Finding, ValidationReport, find_cut, find_repeat, validate_layers
 
 Value = TypeVar("Value")
 
 
 def import_neural() -> ModuleType:
-    """Return the boundary to torch, as `hybrid.job.import_neural`, for a process that runs nothing else."""
+    """Return the boundary to torch, as `hybrid.run.job.import_neural`, for a process that runs nothing else."""
     gc.disable()
     try:
         neural = import_torch()

@@ -9,7 +9,7 @@ import typer
 from hybrid.commands import options as opt
 from hybrid.commands.log import duration, print_table, printable
 from hybrid.files.sequences import format_frames, parse_frames, parse_pattern
-from hybrid.records import (
+from hybrid.run.records import (
     NAMELESS,
     STATES,
     UNTRIED,

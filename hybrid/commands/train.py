@@ -12,11 +12,11 @@ from hybrid.commands.chunks import Chunk, arguments_of
 from hybrid.commands.cluster import run_on_cluster
 from hybrid.commands.log import LOG, Progress
 from hybrid.commands.shots import import_neural, log_cuts, parse_input, parse_layers, validate_renders
+from hybrid.denoising.plan import Context
+from hybrid.denoising.stream import plan_shot
 from hybrid.files.replace import check_outputs
 from hybrid.files.shots import Shot, open_shot
-from hybrid.plan import Context
 from hybrid.runtime.allocator import reuse_freed_memory
-from hybrid.stream import plan_shot
 from network.training.config import SamplerConfig, TrainConfig
 
 

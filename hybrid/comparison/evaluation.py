@@ -18,8 +18,8 @@ from hybrid.comparison.flip import flip_maps
 from hybrid.comparison.results import Statistic, summarize
 from hybrid.comparison.samples import NoiseLaw, decibels, fit_floor, reference_floor
 from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, FLOW, HALVES, REFERENCE, FrameStore
+from hybrid.denoising.plan import STILL
 from hybrid.files.frame import Array, Frame, Frames
-from hybrid.plan import STILL
 
 Measure = Callable[[Array, metrics.Reference, float], float]  # of image, reference, exposure
 Level = tuple[Frames, float]  # a render of the shot, and its samples per pixel

@@ -10,9 +10,7 @@ import numpy as np
 from flow.tvl1 import refine_flow
 from hybrid.alignment.guides import GuideFilter
 from hybrid.alignment.window import AlignedWindow
-from hybrid.files.frame import Array, Frames, MappedShot
-from hybrid.files.shots import Shot
-from hybrid.first_pass import (
+from hybrid.denoising.first_pass import (
     NETWORKS,
     OIDN_MODE_OF_NETWORKS,
     Backends,
@@ -20,11 +18,13 @@ from hybrid.first_pass import (
     named_first_pass,
     read_denoised,
 )
-from hybrid.oidn import Quality
-from hybrid.plan import Rules
-from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window, gated_average
-from hybrid.stabilize import FrameDenoiser
-from hybrid.stream import FrameStream
+from hybrid.denoising.oidn import Quality
+from hybrid.denoising.plan import Rules
+from hybrid.denoising.pseudo_reference import CLASSICAL_PRESETS, filter_window, gated_average
+from hybrid.denoising.stabilize import FrameDenoiser
+from hybrid.denoising.stream import FrameStream
+from hybrid.files.frame import Array, Frames, MappedShot
+from hybrid.files.shots import Shot
 from nlm.average import average, replace_nonfinite, robust_average
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def noisy(shot: Frames) -> Iterator[tuple[int, Array]]:
 
 
 def finished(shot: Frames, *, other: Shot) -> Iterator[tuple[int, Array]]:
-    """Yield the frames that another denoiser has written (`hybrid.first_pass.read_denoised`)."""
+    """Yield the frames that another denoiser has written (`hybrid.denoising.first_pass.read_denoised`)."""
     for number in shot.numbers:
         if other.has(number):
             yield number, read_denoised(other, number)
@@ -192,7 +192,7 @@ def window_maps(aligned: AlignedWindow, denoise: WindowFilter) -> dict[str, Arra
 
 
 def oidn(shot: Frames, *, quality: Quality = "high", prefilter: Quality | None = None) -> Iterator[tuple[int, Array]]:
-    """Run OIDN on each frame by itself; settings as for `hybrid.oidn.denoise_oidn`."""
+    """Run OIDN on each frame by itself; settings as for `hybrid.denoising.oidn.denoise_oidn`."""
     for number in shot.numbers:
         yield number, denoise_frame_oidn(shot.read(number), quality=quality, prefilter=prefilter)
 

@@ -8,8 +8,8 @@ from itertools import product
 from typing import Any
 
 from hybrid.comparison.methods import METHODS, Classical, Method, Network, Run, WindowSettings
-from hybrid.plan import Plan, Rules
-from hybrid.pseudo_reference import STANDARD, ClassicalPreset, filter_window
+from hybrid.denoising.plan import Plan, Rules
+from hybrid.denoising.pseudo_reference import STANDARD, ClassicalPreset, filter_window
 
 # Methods that are varied: the middle classical preset, and networks.
 CLASSICAL, NETWORK, KERNELS = "standard", "fast without OIDN", "tKPCN"

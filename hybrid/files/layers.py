@@ -303,7 +303,7 @@ def _find_unused(image: ExrImage, color: Layer, found: Mapping[str, Layer | None
 
 
 def _is_light(image: ExrImage, layer: Layer) -> bool:
-    """Whether a layer has a name for light; its pixels decide what it is a part of (`hybrid.pass_sums`)."""
+    """Whether a layer has a name for light; its pixels decide what it is a part of (`hybrid.checks.pass_sums`)."""
     plain = _tails(image, layer)[0]
     return bool(_PASS.fullmatch(plain) or _LIGHT_GROUP.match(plain))
 

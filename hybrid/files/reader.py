@@ -24,7 +24,7 @@ from hybrid.files.sources import ReadSources, Source
 
 @dataclass(frozen=True)
 class Interpretation:
-    """How layers are read where that differs from their profile (`hybrid.validation`)."""
+    """How layers are read where that differs from their profile (`hybrid.checks.validation`)."""
 
     left_out: frozenset[str] = frozenset()  # roles that are not read
     motion: MotionConvention | None = None  # convention of the motion vectors

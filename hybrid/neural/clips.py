@@ -10,16 +10,16 @@ import torch
 
 from hybrid.alignment.transfer import measure_exposure
 from hybrid.alignment.window import AlignedWindow
+from hybrid.denoising.first_pass import OIDN_MODES, find_first_pass
+from hybrid.denoising.plan import Rules
+from hybrid.denoising.pseudo_reference import gated_average, pool_and_denoise
+from hybrid.denoising.stream import FrameStream
 from hybrid.files.frame import Array
 from hybrid.files.shots import Shot
-from hybrid.first_pass import OIDN_MODES, find_first_pass
 from hybrid.neural.network_denoiser import exposure_of
 from hybrid.neural.oidn_networks import has_oidn_networks, prefilter_guides
 from hybrid.neural.tiling import image_of, tensor_of
 from hybrid.neural.unet_denoiser import clean_guides, gain_of
-from hybrid.plan import Rules
-from hybrid.pseudo_reference import gated_average, pool_and_denoise
-from hybrid.stream import FrameStream
 from network.training.clips import Clip, importance, important_places, write_shards
 from nlm.average import replace_nonfinite
 from nlm.variance import gaussian_mean

@@ -4,11 +4,11 @@ import numpy as np
 import torch
 
 from hybrid.alignment.window import AlignedWindow
+from hybrid.denoising.stabilize import Denoised
 from hybrid.files.frame import Array
 from hybrid.neural.aovs import share_out
 from hybrid.neural.network_denoiser import NetworkDenoiser, Setup, Tile, exposure_of
 from hybrid.neural.tiling import Block, pad, tensor_of
-from hybrid.stabilize import Denoised
 from network.paper.inputs import KernelWindow
 from network.paper.models import KernelModel, filter_window, for_inference
 

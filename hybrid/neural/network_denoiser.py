@@ -9,10 +9,10 @@ import numpy as np
 import torch
 
 from hybrid.alignment.window import AlignedWindow
-from hybrid.breakdown import Breakdown, layers_of, stage_layers
-from hybrid.denoisers import WindowDenoiser
+from hybrid.denoising.breakdown import Breakdown, layers_of, stage_layers
+from hybrid.denoising.denoisers import WindowDenoiser
+from hybrid.denoising.first_pass import Backends
 from hybrid.files.frame import Array
-from hybrid.first_pass import Backends
 from hybrid.neural.oidn_networks import denoise_bundled, first_pass_memory, torch_backend
 from hybrid.neural.tiling import Block, image_of, tiles
 from hybrid.runtime.timing import Timings

@@ -1,4 +1,4 @@
-"""OIDN's networks in torch, called as `hybrid.oidn` calls OIDN: in bfloat16 in about 0.6 of OIDN's time.
+"""OIDN's networks in torch, called as `hybrid.denoising.oidn` calls OIDN: in bfloat16 in about 0.6 of OIDN's time.
 
 In float32, on processors without bfloat16, they take 0.4 (high) and 0.5 (fast) of the time with AVX2 alone (Zen 3).
 """
@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from hybrid.alignment.transfer import BLACK, measure_gain
+from hybrid.denoising.oidn import Quality
 from hybrid.files.frame import Array
 from hybrid.neural.tiling import image_of, tensor_of, tiles
-from hybrid.oidn import Quality
 from network.bfloat16 import round_unet
 from network.checkpoint import load_model, shipped_weights
 from network.devices import has_bfloat16
@@ -50,7 +50,7 @@ def denoise_unet(
 ) -> Array:
     """Denoise one frame with OIDN's networks; in bfloat16 63 to 66 dB from OIDN's own image.
 
-    Parameters are those of `hybrid.oidn.denoise_oidn`. Without OIDN's weights it raises as
+    Parameters are those of `hybrid.denoising.oidn.denoise_oidn`. Without OIDN's weights it raises as
     `network.oidn_weights.load_oidn`; see `has_oidn_networks`.
     """
     guides = {name: layer for name, layer in (("albedo", albedo), ("normal", normal)) if layer is not None}

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from hybrid.breakdown import Breakdown
+from hybrid.denoising.breakdown import Breakdown
 from hybrid.neural.network_denoiser import NetworkDenoiser, Setup
 from hybrid.neural.unet_denoiser import UNetDenoiser
 from hybrid.runtime.timing import Timings
@@ -22,7 +22,7 @@ def open_network(
     add_layers: bool = False,
     timings: Timings | None = None,
 ) -> NetworkDenoiser:
-    """Load weights, and return the denoiser that runs them; options are those of `hybrid.job.DenoiseOptions`.
+    """Load weights, and return the denoiser that runs them; options are those of `hybrid.run.job.DenoiseOptions`.
 
     A breakdown counts the weights of the frames; each frame's contribution and weight are then further layers. With
     `add_layers` the image is the sum of its light passes, instead of these being scaled to it. Raises ValueError for a

@@ -10,12 +10,12 @@ import torch
 from hybrid.alignment.guides import GuideFilter
 from hybrid.alignment.transfer import measure_exposure, measure_gain
 from hybrid.alignment.window import AlignedWindow, moves_over_noise
+from hybrid.denoising.stabilize import Denoised
 from hybrid.files.frame import Array
 from hybrid.neural.aovs import filter_aovs, share_out
 from hybrid.neural.network_denoiser import NetworkDenoiser, Setup, Tile, exposure_of
 from hybrid.neural.oidn_networks import HALO, has_oidn_networks, prefilter_guides
 from hybrid.neural.tiling import Block, tensor_of
-from hybrid.stabilize import Denoised
 from network.robust_average import UNetWindow, pool
 from network.robust_unet import MIRRORED, RobustUNet, for_inference
 from network.unet import Borders

@@ -21,7 +21,7 @@ from hybrid.files.png import Image8, encode_filmic, encode_srgb
 from hybrid.files.profile import find_profile
 from hybrid.files.sequences import Pattern, find_files, list_patterns, parse_frames, pattern_of
 from hybrid.files.sources import MADE_FROM, parse_object
-from hybrid.records import read_records, sequence_name
+from hybrid.run.records import read_records, sequence_name
 from nlm.average import replace_nonfinite
 
 # Cache of decoded layers, so that another exposure takes milliseconds.
@@ -254,7 +254,7 @@ def _layers(image: ExrImage) -> Layers:
 
 
 def _time_of(name: str) -> tuple[str, int]:
-    """View and offset in time of a weight: before2 is -2, the centre 0 (`hybrid.breakdown.frame_names`)."""
+    """View and offset in time of a weight: before2 is -2, the centre 0 (`hybrid.denoising.breakdown.frame_names`)."""
     picture, _, name = name.rpartition(".")
     digits = name.strip("abcdefghijklmnopqrstuvwxyz")
     return picture, (-1 if name.startswith("before") else 1) * int(digits or 0)

@@ -1,4 +1,4 @@
-"""Settings of a training. The help of `ravg train` says what each means (``hybrid/options.toml``). Needs no torch."""
+"""Settings of a training. The help of `ravg train` says what each means (``run/options.toml``). Needs no torch."""
 
 from dataclasses import dataclass, field
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from flow.motion import CYCLES
 from hybrid.alignment.window import AlignedWindow
+from hybrid.denoising.pseudo_reference import CLASSICAL_PRESETS, filter_window
+from hybrid.denoising.stream import FrameStream
 from hybrid.files.frame import Frame
-from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window
-from hybrid.stream import FrameStream
 from tests.scenes import Scene, only
 
 STAGES = frozenset({"demodulate", "outliers", "warp", "gate", "prefilter"})

@@ -7,9 +7,9 @@ import pytest
 
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
+from hybrid.denoising.pseudo_reference import CLASSICAL_PRESETS, filter_window
 from hybrid.files.exr import read_exr
 from hybrid.files.shots import open_shot
-from hybrid.pseudo_reference import CLASSICAL_PRESETS, filter_window
 from tests.scenes import Scene
 from tests.seldom import seldom
 
@@ -100,7 +100,7 @@ def test_a_picture_that_cannot_be_right_is_not_written(tmp_path, capsys, monkeyp
         image = filter_window(window, CLASSICAL_PRESETS["draft"])
         return image * np.float32(factor) if window.number == MIDDLE else image
 
-    monkeypatch.setattr("hybrid.denoisers.filter_window", spoiled)
+    monkeypatch.setattr("hybrid.denoising.denoisers.filter_window", spoiled)
     folder, out = SCENE.write(tmp_path / "in"), tmp_path / "out"
     assert draft(folder, out) == 1
     assert re.search(f"error: frame {MIDDLE}.*{said}", capsys.readouterr().err)

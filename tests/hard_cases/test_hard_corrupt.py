@@ -7,8 +7,8 @@ import pytest
 
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
-from hybrid.first_pass import PerFrame
-from hybrid.pseudo_reference import FINAL, STANDARD, filter_window
+from hybrid.denoising.first_pass import PerFrame
+from hybrid.denoising.pseudo_reference import FINAL, STANDARD, filter_window
 from tests.hard_cases.hard import (
     MIDDLE,
     SCENE,

@@ -13,7 +13,7 @@ import OpenEXR
 import pytest
 
 from hybrid.files.exr import read_exr
-from hybrid.records import FOLDER
+from hybrid.run.records import FOLDER
 from tests.commands import ravg
 from tests.seldom import seldom
 

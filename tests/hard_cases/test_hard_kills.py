@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from hybrid.records import FOLDER
+from hybrid.run.records import FOLDER
 from loops import parallel
 from tests.commands import Done, start
 from tests.scenes import Scene

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from hybrid.arrays import denoise_arrays
 from hybrid.comparison.metrics import psnr
-from hybrid.first_pass import Classical
-from hybrid.pseudo_reference import CLASSICAL_PRESETS, STANDARD
+from hybrid.denoising.first_pass import Classical
+from hybrid.denoising.pseudo_reference import CLASSICAL_PRESETS, STANDARD
+from hybrid.run.arrays import denoise_arrays
 from tests.hard_cases.hard import (
     MIDDLE,
     REACH,

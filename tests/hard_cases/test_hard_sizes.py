@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from flow.tvl1 import dense_flow, refine_flow
-from hybrid.arrays import denoise_arrays
-from hybrid.first_pass import PerFrame
-from hybrid.pseudo_reference import CLASSICAL_PRESETS
-from hybrid.stream import plan_shot
+from hybrid.denoising.first_pass import PerFrame
+from hybrid.denoising.pseudo_reference import CLASSICAL_PRESETS
+from hybrid.denoising.stream import plan_shot
+from hybrid.run.arrays import denoise_arrays
 from tests.flow.scenes import plain
 from tests.hard_cases.hard import STAGES, Reel, align, constant, denoise, itself, spoil
 from tests.seldom import seldom

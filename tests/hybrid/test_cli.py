@@ -17,11 +17,11 @@ import typer
 from hybrid.cli import COMMANDS, LazyCommand, main
 from hybrid.commands.options import check_first_pass
 from hybrid.comparison.metrics import psnr
+from hybrid.denoising.first_pass import SPECS
+from hybrid.denoising.plan import STAGES
 from hybrid.files.exr import read_exr
-from hybrid.first_pass import SPECS
-from hybrid.option_texts import option_texts
-from hybrid.plan import STAGES
-from hybrid.records import read_records
+from hybrid.run.option_texts import option_texts
+from hybrid.run.records import read_records
 from tests.commands import words_in
 from tests.scenes import Scene, grained
 

@@ -11,22 +11,22 @@ import numpy as np
 import pytest
 
 import hybrid
-from hybrid import budget, job
 from hybrid.alignment.align import align
 from hybrid.alignment.measure import measure_frame as measure
 from hybrid.cli import main
 from hybrid.commands.shots import ShotInput
 from hybrid.comparison.results import Comparison
+from hybrid.denoising.plan import Rules
+from hybrid.denoising.stabilize import Denoised, FrameDenoiser, FrameResult
+from hybrid.denoising.stream import FrameStream
 from hybrid.files.decode import decode_frame
 from hybrid.files.exr import read_exr
 from hybrid.files.replace import replace_file
 from hybrid.files.shots import open_matching_sequence, open_shot
-from hybrid.memory import MemoryPlan, plan_memory
-from hybrid.pipeline import View, denoise_frames
-from hybrid.plan import Rules
-from hybrid.records import read_records
-from hybrid.stabilize import Denoised, FrameDenoiser, FrameResult
-from hybrid.stream import FrameStream
+from hybrid.run import budget, job
+from hybrid.run.memory import MemoryPlan, plan_memory
+from hybrid.run.pipeline import View, denoise_frames
+from hybrid.run.records import read_records
 from tests.scenes import Scene
 
 ROOT = Path(__file__).parents[2]
@@ -251,7 +251,7 @@ def test_measurements_of_frames_that_have_passed_are_dropped(shot_folder, monkey
         measured.append(frame.number)
         return measure(frame, small)
 
-    monkeypatch.setattr("hybrid.stream.measure_frame", measure_frame)
+    monkeypatch.setattr("hybrid.denoising.stream.measure_frame", measure_frame)
     stream = FrameStream(open_shot(shot_folder), Rules())
     stream.measurements([1001, 1002])
     stream.keep([1002, 1003])
@@ -279,7 +279,7 @@ def test_the_header_has_the_stages_of_the_first_view_and_the_neighbours_of_all(t
             averaged = (number, number + 1) if self.first else (number,)
             return FrameResult(Denoised(color), plan, averaged, 0.0, 0.0, 0, 0, 0, 0)
 
-    monkeypatch.setattr("hybrid.pipeline.FrameDenoiser", Fake)
+    monkeypatch.setattr("hybrid.run.pipeline.FrameDenoiser", Fake)
     views = open_shot(Scene(frames=2).write(tmp_path / "in", edit=edit)).views
     assert len(list(denoise_frames([View(view) for view in views], tmp_path / "out", Denoised, Rules()))) == 2
     header = read_exr(tmp_path / "out" / "shot.1001.exr").parts[0].header
@@ -288,7 +288,9 @@ def test_the_header_has_the_stages_of_the_first_view_and_the_neighbours_of_all(t
 
 
 def test_the_outliers_of_all_bands_are_counted(shot_folder, monkeypatch):
-    monkeypatch.setattr("hybrid.stabilize.align", lambda *args, **options: replace(align(*args, **options), outliers=3))
+    monkeypatch.setattr(
+        "hybrid.denoising.stabilize.align", lambda *args, **options: replace(align(*args, **options), outliers=3)
+    )
     stream = FrameStream(open_shot(shot_folder), Rules(off=frozenset({"stabilize"})))
 
     def denoise(aligned):

@@ -4,12 +4,12 @@ import collections
 
 import pytest
 
-from hybrid import stabilize, stream
 from hybrid.alignment import align, flows, prepare
+from hybrid.denoising import stabilize, stream
+from hybrid.denoising.first_pass import PerFrame
+from hybrid.denoising.plan import Rules
+from hybrid.denoising.stabilize import Denoised
 from hybrid.files.shots import Shot, open_shot
-from hybrid.first_pass import PerFrame
-from hybrid.plan import Rules
-from hybrid.stabilize import Denoised
 from tests.scenes import Scene, denoise_view
 
 FRAMES, RADIUS = 10, 2

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from hybrid.cli import main
-from hybrid.job import METHOD_OF_PRESET
-from hybrid.records import read_records
+from hybrid.run.job import METHOD_OF_PRESET
+from hybrid.run.records import read_records
 from tests.scenes import Scene
 
 ROOT = Path(__file__).parents[2]

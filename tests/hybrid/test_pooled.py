@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid import pseudo_reference
 from hybrid.alignment.transfer import demodulate, measure_gain
 from hybrid.comparison.metrics import psnr
+from hybrid.denoising import pseudo_reference
+from hybrid.denoising.first_pass import PerFrame, find_first_pass
+from hybrid.denoising.pseudo_reference import SECOND_LOOK, gated_average, pool_and_denoise
+from hybrid.denoising.stabilize import Denoised, FrameDenoiser
+from hybrid.denoising.stream import FrameStream
 from hybrid.files.shots import open_shot
-from hybrid.first_pass import PerFrame, find_first_pass
-from hybrid.pseudo_reference import SECOND_LOOK, gated_average, pool_and_denoise
-from hybrid.stabilize import Denoised, FrameDenoiser
-from hybrid.stream import FrameStream
 from tests.scenes import Scene, only
 
 STAGES = {"demodulate", "warp", "gate"}

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from hybrid.denoisers import AverageDenoiser
+from hybrid.denoising.denoisers import AverageDenoiser
+from hybrid.denoising.first_pass import PerFrame
+from hybrid.denoising.plan import DENOISED, NOISY, Rules
+from hybrid.denoising.stream import FrameStream, plan_shot
 from hybrid.files.shots import open_shot
-from hybrid.first_pass import PerFrame
-from hybrid.plan import DENOISED, NOISY, Rules
 from hybrid.runtime.timing import Timings
-from hybrid.stream import FrameStream, plan_shot
 from tests.scenes import Scene, denoise_view, grained
 
 WALL = Scene(72, 112, 7, noise=0.2)

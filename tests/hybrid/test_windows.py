@@ -8,15 +8,15 @@ import pytest
 from hybrid.alignment.measure import fixed_noise
 from hybrid.alignment.prepare import prepare
 from hybrid.cli import main
+from hybrid.denoising.first_pass import PerFrame
+from hybrid.denoising.plan import DENOISED, NOISY, STAGES, Rules
+from hybrid.denoising.pseudo_reference import STANDARD, filter_window, gated_average
+from hybrid.denoising.stabilize import Denoised
+from hybrid.denoising.stream import FrameStream, plan_shot
 from hybrid.files import reader as reader_module
 from hybrid.files.exr import read_exr
 from hybrid.files.shots import open_shot
-from hybrid.first_pass import PerFrame
-from hybrid.plan import DENOISED, NOISY, STAGES, Rules
-from hybrid.pseudo_reference import STANDARD, filter_window, gated_average
-from hybrid.records import read_records
-from hybrid.stabilize import Denoised
-from hybrid.stream import FrameStream, plan_shot
+from hybrid.run.records import read_records
 from tests.scenes import Scene, denoise_view
 from tests.seldom import seldom
 

@@ -54,7 +54,7 @@ def test_one_that_is_not_there_is_named_with_those_that_are(monkeypatch):
 
 
 def test_every_name_is_a_name_of_oidns_too():
-    from hybrid.oidn import DEVICES as THEIRS
+    from hybrid.denoising.oidn import DEVICES as THEIRS
 
     assert set(DEVICES) == {"auto", *THEIRS}
     assert set(devices._accelerators()) <= set(THEIRS)

@@ -42,7 +42,7 @@ class TestOidn:
         ],
     )
     def test_gives_oidns_pictures(self, name: str, inputs: int, quality: str, clean: bool) -> None:
-        from hybrid.oidn import denoise_oidn
+        from hybrid.denoising.oidn import denoise_oidn
 
         layers = scene()[:inputs]
         expected = denoise_oidn(*map(as_image, layers), quality=quality, clean=clean)  # type: ignore[arg-type]
@@ -52,7 +52,7 @@ class TestOidn:
 
     @pytest.mark.parametrize(("quality", "suffix"), [("high", "_large"), ("balanced", "")])
     def test_gives_oidns_guides(self, quality: str, suffix: str) -> None:
-        from hybrid.oidn import _execute
+        from hybrid.denoising.oidn import _execute
 
         _, albedo, normal = scene()
         expected = _execute({"albedo": as_image(albedo)}, quality, "cpu")

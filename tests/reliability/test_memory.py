@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from hybrid.files.exr import read_exr
-from hybrid.memory import parse_size
-from hybrid.records import read_records
+from hybrid.run.memory import parse_size
+from hybrid.run.records import read_records
 from tests.exr_files import write_layers
 
 pytestmark = pytest.mark.reliability

@@ -13,9 +13,9 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from hybrid.denoising.plan import Rules
+from hybrid.denoising.stream import FrameStream
 from hybrid.files.shots import open_shot
-from hybrid.plan import Rules
-from hybrid.stream import FrameStream
 from tests.commands import ravg
 from tests.reliability.shots import (
     ALBEDO,

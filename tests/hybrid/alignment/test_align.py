@@ -10,9 +10,9 @@ import pytest
 from hybrid.alignment.align import align
 from hybrid.alignment.measure import least_outline_noise
 from hybrid.alignment.transfer import ALBEDO_FLOOR
+from hybrid.denoising.first_pass import PerFrame
+from hybrid.denoising.stream import FrameStream
 from hybrid.files.shots import open_shot
-from hybrid.first_pass import PerFrame
-from hybrid.stream import FrameStream
 from tests.scenes import Scene, only
 
 STAGES = {"demodulate", "outliers", "warp"}

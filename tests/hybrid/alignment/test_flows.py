@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hybrid.denoising.stream import FrameStream
 from hybrid.files.shots import open_shot
-from hybrid.stream import FrameStream
 from tests.scenes import Scene, only
 
 STAGES = {"demodulate", "outliers", "warp"}

@@ -6,9 +6,9 @@ import numpy as np
 
 from hybrid.alignment.align import align
 from hybrid.alignment.guides import average_guides
+from hybrid.denoising.first_pass import PerFrame
+from hybrid.denoising.stream import FrameStream
 from hybrid.files.shots import open_shot
-from hybrid.first_pass import PerFrame
-from hybrid.stream import FrameStream
 from tests.scenes import Scene, only
 
 SHAPE = (12, 16)

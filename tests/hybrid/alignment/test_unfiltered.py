@@ -13,14 +13,14 @@ import pytest
 from hybrid.alignment.prepare import prepare
 from hybrid.alignment.unfiltered import find_region, mirror_region, split_unfiltered
 from hybrid.cli import main
+from hybrid.denoising.first_pass import PerFrame
+from hybrid.denoising.plan import Rules
+from hybrid.denoising.pseudo_reference import gated_average
+from hybrid.denoising.stabilize import Denoised, FrameDenoiser
+from hybrid.denoising.stream import FrameStream
 from hybrid.files.exr import HALF_MAX, read_exr
 from hybrid.files.frame import Frame
 from hybrid.files.shots import open_shot
-from hybrid.first_pass import PerFrame
-from hybrid.plan import Rules
-from hybrid.pseudo_reference import gated_average
-from hybrid.stabilize import Denoised, FrameDenoiser
-from hybrid.stream import FrameStream
 from tests.exr_files import write_layers
 from tests.scenes import Scene
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from hybrid.alignment.window import warp_rows
+from hybrid.denoising.first_pass import PerFrame
+from hybrid.denoising.stream import FrameStream
 from hybrid.files.shots import open_shot
-from hybrid.first_pass import PerFrame
-from hybrid.stream import FrameStream
 from nlm.average import replace_nonfinite
 from tests.scenes import Scene, only
 

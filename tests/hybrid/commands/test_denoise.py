@@ -9,7 +9,7 @@ import pytest
 from hybrid.cli import main
 from hybrid.files.exr import read_exr
 from hybrid.files.shots import open_shot
-from hybrid.records import read_records
+from hybrid.run.records import read_records
 from tests.scenes import Scene
 
 KERNELS = Path(__file__).parents[2] / "data" / "small.safetensors"

@@ -9,8 +9,8 @@ import typer
 from hybrid.cli import COMMANDS, LazyCommand, main
 from hybrid.commands.compare import _Report
 from hybrid.commands.options import LogOptions, check_first_pass, split_number
-from hybrid.job import DenoiseOptions
-from hybrid.option_texts import TEXTS, option_texts
+from hybrid.run.job import DenoiseOptions
+from hybrid.run.option_texts import TEXTS, option_texts
 from hybrid.simulate.shot import ShotSettings
 from network.training.config import SamplerConfig, TrainConfig
 

@@ -13,12 +13,12 @@ from hybrid.alignment.window import AlignedWindow
 from hybrid.comparison import methods
 from hybrid.comparison.methods import METHODS, Network, WindowSettings, aligned_average, window_maps
 from hybrid.comparison.metrics import psnr
+from hybrid.denoising.plan import Rules
+from hybrid.denoising.pseudo_reference import filter_window
+from hybrid.denoising.stabilize import Denoised
+from hybrid.denoising.stream import FrameStream
 from hybrid.files.shots import Shot, open_shot
 from hybrid.files.sources import MADE_FROM
-from hybrid.plan import Rules
-from hybrid.pseudo_reference import filter_window
-from hybrid.stabilize import Denoised
-from hybrid.stream import FrameStream
 from nlm.average import average
 from tests.exr_files import write_layers
 from tests.scenes import Scene, only
@@ -103,7 +103,7 @@ def test_methods_are_told_apart_by_names_that_a_command_line_can_list() -> None:
 
 
 def test_a_missing_estimate_makes_a_method_absent(shot: Shot, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from hybrid import first_pass
+    from hybrid.denoising import first_pass
 
     monkeypatch.setattr(first_pass, "why_no_oidn", lambda: "pyoidn is not installed")
     with pytest.raises(ImportError, match="pyoidn is not installed"):

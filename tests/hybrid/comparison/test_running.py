@@ -16,8 +16,8 @@ from hybrid.comparison import running
 from hybrid.comparison.methods import METHODS, Method
 from hybrid.comparison.running import RunCost, Seconds, run_method, summarize_runs, time_methods
 from hybrid.comparison.store import FrameStore
+from hybrid.denoising.oidn import denoise_oidn
 from hybrid.files.frame import Frame
-from hybrid.oidn import denoise_oidn
 from hybrid.runtime import timing
 from tests.hybrid.comparison.shots import NOISY, SIZE, Array, MemoryShot, make_shots, perfect, ways
 

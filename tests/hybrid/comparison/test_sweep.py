@@ -10,9 +10,9 @@ import pytest
 from hybrid.comparison import methods
 from hybrid.comparison.methods import METHODS
 from hybrid.comparison.sweep import CLASSICAL, KERNELS, NETWORK, sweep_methods
+from hybrid.denoising.plan import STAGES
+from hybrid.denoising.stream import plan_shot
 from hybrid.files.shots import Shot, open_shot
-from hybrid.plan import STAGES
-from hybrid.stream import plan_shot
 from tests.scenes import Scene
 
 SCENE = Scene(frames=3, height=32, width=40)

@@ -8,11 +8,11 @@ import OpenEXR
 import pytest
 
 from flow.motion import CYCLES
+from hybrid.denoising.plan import Rules
+from hybrid.denoising.stream import FrameStream
 from hybrid.files.exr import read_exr
 from hybrid.files.reader import Interpretation
 from hybrid.files.shots import Shot, open_shot, output_path
-from hybrid.plan import Rules
-from hybrid.stream import FrameStream
 from tests.exr_files import SIZE, exchange, flat_image, save_frames, write_layers
 from tests.renderers import layer
 

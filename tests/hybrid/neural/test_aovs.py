@@ -7,12 +7,12 @@ from tests.scenes import Scene, only
 
 pytest.importorskip("torch")
 
+from hybrid.checks.validation import validate_layers
+from hybrid.denoising.first_pass import Classical
+from hybrid.denoising.pseudo_reference import DRAFT
+from hybrid.denoising.stream import FrameStream
 from hybrid.files.shots import open_shot
-from hybrid.first_pass import Classical
 from hybrid.neural import open_network
-from hybrid.pseudo_reference import DRAFT
-from hybrid.stream import FrameStream
-from hybrid.validation import validate_layers
 from network.checkpoint import shipped_weights
 
 pytestmark = pytest.mark.neural

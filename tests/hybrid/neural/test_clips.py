@@ -7,15 +7,15 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from hybrid import first_pass, pseudo_reference
+from hybrid.denoising import first_pass, pseudo_reference
+from hybrid.denoising.first_pass import Classical, find_first_pass
+from hybrid.denoising.plan import Rules
+from hybrid.denoising.pseudo_reference import FINAL, gated_average, pool_and_denoise
+from hybrid.denoising.stream import FrameStream
 from hybrid.files.shots import open_shot
-from hybrid.first_pass import Classical, find_first_pass
 from hybrid.neural import clips as module
 from hybrid.neural import open_network, unet_denoiser
 from hybrid.neural.clips import ClipSource, write_clips
-from hybrid.plan import Rules
-from hybrid.pseudo_reference import FINAL, gated_average, pool_and_denoise
-from hybrid.stream import FrameStream
 from network.checkpoint import save_model
 from network.presets import build_preset
 from network.robust_average import RobustAverage

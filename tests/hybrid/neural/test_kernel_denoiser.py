@@ -8,10 +8,10 @@ import pytest
 
 pytest.importorskip("torch")
 
-from hybrid.breakdown import Breakdown
+from hybrid.denoising.breakdown import Breakdown
+from hybrid.denoising.stream import FrameStream
 from hybrid.files.shots import open_shot
 from hybrid.neural import open_network
-from hybrid.stream import FrameStream
 from tests.scenes import only
 
 pytestmark = pytest.mark.neural

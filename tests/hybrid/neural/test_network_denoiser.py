@@ -6,13 +6,13 @@ from tests.scenes import Scene, only
 
 torch = pytest.importorskip("torch")
 
-from hybrid.breakdown import Breakdown  # noqa: E402
+from hybrid.checks.validation import validate_layers  # noqa: E402
+from hybrid.denoising.breakdown import Breakdown  # noqa: E402
+from hybrid.denoising.first_pass import Classical  # noqa: E402
+from hybrid.denoising.pseudo_reference import DRAFT  # noqa: E402
+from hybrid.denoising.stream import FrameStream  # noqa: E402
 from hybrid.files.shots import open_shot  # noqa: E402
-from hybrid.first_pass import Classical  # noqa: E402
 from hybrid.neural import open_network  # noqa: E402
-from hybrid.pseudo_reference import DRAFT  # noqa: E402
-from hybrid.stream import FrameStream  # noqa: E402
-from hybrid.validation import validate_layers  # noqa: E402
 from network.checkpoint import save_model, shipped_weights  # noqa: E402
 from network.presets import build_preset  # noqa: E402
 

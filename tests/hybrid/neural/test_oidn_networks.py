@@ -12,12 +12,12 @@ torch = pytest.importorskip("torch")
 
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
+from hybrid.denoising.first_pass import OIDN_MODES, Backends, denoise_frame_oidn, find_first_pass, named_first_pass
+from hybrid.denoising.stream import FrameStream
 from hybrid.files.frame import Frame
 from hybrid.files.shots import open_shot
-from hybrid.first_pass import OIDN_MODES, Backends, denoise_frame_oidn, find_first_pass, named_first_pass
 from hybrid.neural import oidn_networks
 from hybrid.neural.oidn_networks import denoise_bundled, denoise_unet
-from hybrid.stream import FrameStream
 from network.oidn_weights import OIDN_WEIGHTS
 from network.unet import OidnUNet, OidnUNetConfig
 from tests.scenes import Scene, only

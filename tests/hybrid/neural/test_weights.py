@@ -12,12 +12,12 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from hybrid.comparison.metrics import mean_bias, psnr
+from hybrid.denoising.first_pass import NETWORKS, Classical
+from hybrid.denoising.plan import Rules
+from hybrid.denoising.pseudo_reference import FINAL, filter_window, gated_average
+from hybrid.denoising.stream import FrameStream
 from hybrid.files.shots import open_shot
-from hybrid.first_pass import NETWORKS, Classical
 from hybrid.neural import open_network
-from hybrid.plan import Rules
-from hybrid.pseudo_reference import FINAL, filter_window, gated_average
-from hybrid.stream import FrameStream
 from network.checkpoint import find_weights, load_model, save_model, shipped_weights
 from network.presets import build_preset
 from network.robust_average import RobustAverage

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hybrid.files.png import encode_filmic, encode_srgb
-from hybrid.records import Record
+from hybrid.run.records import Record
 from hybrid.runtime.timing import Stage, Timings
 from hybrid.viewer.sequence import Sequence
 from hybrid.viewer.server import ViewServer

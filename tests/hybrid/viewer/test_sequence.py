@@ -12,7 +12,7 @@ import pytest
 
 from hybrid.files.exr import ExrError, read_exr
 from hybrid.files.png import encode_srgb
-from hybrid.records import Record
+from hybrid.run.records import Record
 from hybrid.runtime.timing import Timings
 from hybrid.viewer import sequence as module
 from hybrid.viewer.sequence import Sequence, encode_picture

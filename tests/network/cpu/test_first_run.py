@@ -8,12 +8,12 @@ from numba.core import event
 
 torch = pytest.importorskip("torch")
 
+from hybrid.denoising.first_pass import Classical
+from hybrid.denoising.pseudo_reference import DRAFT
+from hybrid.denoising.stream import FrameStream
 from hybrid.files.shots import open_shot
-from hybrid.first_pass import Classical
 from hybrid.neural import open_network, shipped_weights
 from hybrid.neural.oidn_networks import denoise_bundled
-from hybrid.pseudo_reference import DRAFT
-from hybrid.stream import FrameStream
 from network.cpu.first_run import compile_loops
 from tests.scenes import Scene, only
 
