@@ -15,15 +15,15 @@ from nlm.interpolation import interpolation_weight, measure_noise
 from nlm.moving_lights import confirmed_by_neighbour, find_bright, passing_lights, trail_of
 from nlm.nonlocal_means import joint_nlm
 from nlm.parts import filter_layers, find_sums, split_light, sums_to
-from nlm.pooling import PooledSamples, SampleRange, clamp_to_range, find_range, pool_samples
+from nlm.pooling import PooledSamples, pool_samples
 from nlm.relight import relight
 from nlm.samples import SampleMean, average_neighbours, beside_lamps, blend_samples, limit_lamps, restore_mean
 from nlm.variance import prefilter_guide, smooth_variance, variance_from_halves, variance_from_window
 
 __all__ = [
-    "Highlights", "PooledSamples", "SampleMean", "SampleRange", "agreement_weight", "average", "average_neighbours",
-    "beside_lamps", "blend_samples", "clamp_to_range", "color_gate", "color_gates", "confirmed_by_neighbour",
-    "drift_weights", "filter_layers", "find_bright", "find_bright_samples", "find_range", "find_sums",
+    "Highlights", "PooledSamples", "SampleMean", "agreement_weight", "average", "average_neighbours",
+    "beside_lamps", "blend_samples", "color_gate", "color_gates", "confirmed_by_neighbour",
+    "drift_weights", "filter_layers", "find_bright", "find_bright_samples", "find_sums",
     "guided_filter", "interpolation_weight", "joint_nlm", "limit_lamps", "measure_guide", "measure_highlights",
     "measure_noise", "passing_lights", "pool_samples", "prefilter_guide", "pull_to_centre", "reject_outliers",
     "relight", "replace_fireflies", "replace_nonfinite", "restore_mean", "robust_average", "smooth_variance",

@@ -1,14 +1,12 @@
 """Samples of all frames of a window, pooled at the centre before denoising."""
 
-from collections.abc import Iterable
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numba import njit
 
 from loops.parallel import Floats, run_bands
-from nlm.average import check_exposure, check_strip, check_window
+from nlm.average import check_exposure, check_window
 
 # A residual counts up to so many times the pixel's light and the exposure. Noise of a few samples seldom exceeds this
 # limit; a firefly exceeds it hundreds of times, and no denoiser removes such a value: at 15 to 30 samples pictures
@@ -59,38 +57,6 @@ def pool_samples(estimates: Floats, residuals: Floats, confidence: Floats, expos
     return pooled
 
 
-class SampleRange(NamedTuple):
-    """Least and greatest of the estimates and the samples of all frames of a window, (H, W, 3) each."""
-
-    low: Floats
-    high: Floats
-
-    @classmethod
-    def empty(cls, shape: tuple[int, ...]) -> Self:
-        """Make the range of a picture of this shape, to be filled by `add`."""
-        return cls(np.empty(shape, np.float32), np.empty(shape, np.float32))
-
-    def add(self, estimates: Floats, residuals: Floats, top: int) -> None:
-        """Fill the rows from `top` on by residuals (T, h, W, 3) and all estimates of `pool_samples`, where finite."""
-        check_strip(residuals, estimates, top)
-        run_bands(_range, residuals.shape[1], estimates, residuals, *self, top)
-
-
-def find_range(estimates: Floats, residuals: Iterable[tuple[int, Floats]]) -> SampleRange:
-    """Find the range of a window from its residuals in strips of rows, with the first row of each."""
-    found = SampleRange.empty(estimates.shape[1:])
-    for top, strip in residuals:
-        found.add(estimates, strip, top)
-    return found
-
-
-def clamp_to_range(picture: Floats, found: SampleRange) -> Floats:
-    """Clamp each channel of a picture (H, W, 3) to the range of a window within 3×3 pixels."""
-    box = np.ones((3, 3), np.uint8)
-    low, high = cv2.erode(found.low, box), cv2.dilate(found.high, box)
-    return np.clip(picture, low.reshape(picture.shape), high.reshape(picture.shape))
-
-
 @njit(cache=True, nogil=True)
 def _pool(
     first: int, last: int, estimates: Floats, residuals: Floats, confidence: Floats, exposure: np.float32,
@@ -125,24 +91,3 @@ def _pool(
                     pooled.image[y, x, c] = (light[c] + noise[c]) / total
                 else:
                     pooled.average[y, x, c] = pooled.image[y, x, c] = estimates[T // 2, y, x, c]
-
-
-@njit(cache=True, nogil=True)
-def _range(first: int, last: int, estimates: Floats, residuals: Floats, low: Floats, high: Floats, top: int) -> None:
-    """Write the least and the greatest finite value of the estimates and the samples of all frames."""
-    infinite = np.float32(np.inf)
-    for row in range(first, last):
-        y = top + row
-        least, most = low[y].reshape(-1), high[y].reshape(-1)
-        least[:], most[:] = infinite, -infinite
-        for t in range(len(estimates)):
-            estimate, residual = estimates[t, y].reshape(-1), residuals[t, row].reshape(-1)
-            # Choices and no branches, so that several values are computed at once.
-            for i in range(len(least)):
-                value = estimate[i]
-                sample = value + residual[i]
-                finite, whole = abs(value) < infinite, abs(sample) < infinite
-                least[i] = value if finite and value < least[i] else least[i]
-                most[i] = value if finite and value > most[i] else most[i]
-                least[i] = sample if whole and sample < least[i] else least[i]
-                most[i] = sample if whole and sample > most[i] else most[i]

@@ -1,6 +1,6 @@
 """Align a window of frames to its centre (`align`), and the results of three frames to each other."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -30,7 +30,6 @@ from nlm.average import average, reject_outliers
 from nlm.drift import drift_weights, pull_to_centre
 from nlm.gate import agreement_weight, color_gate, color_gates
 from nlm.interpolation import interpolation_weight, measure_noise
-from nlm.pooling import SampleRange
 from nlm.relight import relight
 from nlm.samples import SampleMean, average_neighbours
 
@@ -73,22 +72,21 @@ def align(
     window: Window,
     rows: slice | None = None,
     *,
-    ranged: bool = False,
     guided: bool = True,
     timings: Timings | None = None,
 ) -> AlignedWindow:
     """Warp all frames of a window to its centre, and measure the confidence in each pixel.
 
-    With `rows` only these rows of the frame, and `MARGIN` around them. With `ranged` the range of the samples is found
-    while they are averaged; without `guided` only the filter of AOVs reads `AlignedWindow.guide`. All frames have
-    the same layers (`expect_equal_layers`). Raises ValueError if the centre has no first pass and others do.
+    With `rows` only these rows of the frame, and `MARGIN` around them. Without `guided` only the
+    filter of AOVs reads `AlignedWindow.guide`. All frames have the same layers (`expect_equal_layers`). Raises
+    ValueError if the centre has no first pass and others do.
     """
     timings = timings or Timings()
     padded, inner = _pad_rows(rows, len(window.centre.irradiance))
     if window.first_pass is None:
         aligned = _align_noisy(window, padded, inner, timings)
     else:
-        aligned = _align_denoised(window, window.first_pass, padded, inner, ranged, timings)
+        aligned = _align_denoised(window, window.first_pass, padded, inner, timings)
     if guided or window.centre.aovs:
         return aligned
     return replace(aligned, centre=replace(aligned.centre, clean_albedo=None), geometric_confidence=None)
@@ -127,7 +125,7 @@ def _align_noisy(window: Window, rows: slice, inner: slice, timings: Timings) ->
 
 
 def _align_denoised(
-    window: Window, first_pass: Sequence[Array | None], rows: slice, inner: slice, ranged: bool, timings: Timings
+    window: Window, first_pass: Sequence[Array | None], rows: slice, inner: slice, timings: Timings
 ) -> AlignedWindow:
     """Align frames that have a first pass.
 
@@ -144,11 +142,11 @@ def _align_denoised(
         with timings.stage("confidence"):
             filtered_guides = average_guides(window.filtered_guides, sources.flows, aligned.confidence, rows)
     estimates, interpolation = _warp_first_pass(window, first_pass, coverage, rows, timings)
-    plain = None
+    along_surfaces = None
     if window.reflections is not None and "blend-samples" in stages and not moves_over_noise(stages):
-        along_surfaces = replace(window, reflections=None)
-        plain, _ = _warp_first_pass(along_surfaces, first_pass, coverage, rows, timings, weigh=False)
-        plain /= aligned.modulation
+        surfaces = replace(window, reflections=None)
+        along_surfaces, _ = _warp_first_pass(surfaces, first_pass, coverage, rows, timings, weigh=False)
+        along_surfaces /= aligned.modulation
     with timings.stage("confidence"):
         pictures, complete = [estimates, *aligned.aovs.values()], aligned.confidence[middle].all()
         if not complete:
@@ -167,28 +165,14 @@ def _align_denoised(
             agreement = agreement_weight(estimates, irradiance, confidence, exposure)
             confidence[:middle] *= agreement
             confidence[middle + 1 :] *= agreement
-        pull = drift_weight = samples = known_range = None
+        pull = drift_weight = None
         if "drift" in stages:
             pull = drift_weights(estimates, irradiance, confidence, exposure, first_row=rows.start)
             before, after = window.links[middle - 2 : middle], window.links[middle + 1 : middle + 3]
             if None not in before or None not in after:  # two frames on one side show drift
                 drift_weight = pull[middle + 1].copy()  # a view would keep the weights of all frames in memory
-        if "blend-samples" in stages and moves_over_noise(stages):
-            # Noise that frames share would pass for detail: 6 to 12 dB of a slow pan.
-            samples = SampleMean.unknown(irradiance.shape)
-        elif "blend-samples" in stages and plain is not None:
-            # With next to no noise samples are right where the motion that was found is wrong.
-            strips = replace(sources, light_flows=sources.flows).residual_strips()
-            noisy = window.centre.radiance[rows]
-            assert window.reflections is not None
-            light = confidence * ~window.reflections[rows].any(axis=-1)  # that of the shifted frames says nothing here
-            samples = average_neighbours(plain, strips, light, aligned.confidence, aligned.modulation, noisy)
-        elif "blend-samples" in stages:
-            known_range = SampleRange.empty(irradiance.shape) if ranged else None
-            strips = _pull_behind(sources.residual_strips(), estimates, confidence, pull, known_range)
-            noisy = window.centre.radiance[rows]
-            samples = average_neighbours(estimates, strips, confidence, aligned.confidence, aligned.modulation, noisy)
-        if pull is not None and (samples is None or moves_over_noise(stages) or plain is not None):
+        samples = _average_samples(window, aligned, estimates, along_surfaces, confidence, rows)
+        if pull is not None:
             pull_to_centre(estimates, confidence, pull)
     return replace(
         aligned,
@@ -198,7 +182,33 @@ def _align_denoised(
         neighbours=replace(aligned.neighbours, samples=samples, drift_weight=drift_weight),
         confidence=confidence,
         first_pass=estimates,
-        known_range=known_range,
+    )
+
+
+def _average_samples(
+    window: Window,
+    aligned: AlignedWindow,
+    estimates: Array,
+    along_surfaces: Array | None,
+    confidence: Array,
+    rows: slice,
+) -> SampleMean | None:
+    """Average the neighbours' samples for the stage *blend-samples*, along surfaces where reflections are followed.
+
+    With next to no noise samples are right where the motion of a reflection is not.
+    """
+    if "blend-samples" not in window.stages:
+        return None
+    if moves_over_noise(window.stages):
+        # Noise that frames share would pass for detail: 6 to 12 dB of a slow pan.
+        return SampleMean.unknown(estimates.shape[1:])
+    sources, counted = aligned.sources, confidence
+    if along_surfaces is not None and window.reflections is not None:
+        estimates, sources = along_surfaces, replace(sources, light_flows=sources.flows)
+        counted = confidence * ~window.reflections[rows].any(axis=-1)  # elsewhere the gate compared other pixels
+    noisy = window.centre.radiance[rows]
+    return average_neighbours(
+        estimates, sources.residual_strips(), counted, aligned.confidence, aligned.modulation, noisy
     )
 
 
@@ -404,13 +414,10 @@ def _warp_first_pass(
                 weights[index] = interpolation_weight(warped[index], bilinear, noise)
             if noise is not None and window.reflections is not None:
                 # Motion that was found may be wrong where vectors are right, as at outlines.
-                found, errs = (
-                    window.reflections[rows].any(axis=-1),
-                    interpolation_weight(warped[index], middle[rows], noise),
-                )
-                weights[index] = np.where(found, errs, np.float32(1)) * (
-                    1 if weights[index] is None else weights[index]
-                )
+                error_weight = interpolation_weight(warped[index], middle[rows], noise)
+                error_weight[~window.reflections[rows].any(axis=-1)] = 1
+                known = weights[index]
+                weights[index] = error_weight if known is None else known * error_weight
             fill_uncovered(warped[index], middle[rows], coverage[index])
         window.release()
     return warped, weights
@@ -426,22 +433,3 @@ def _fill_centre(pictures: Iterable[Array], confidence: Array) -> None:
     if gone.any():
         for picture in pictures:
             picture[middle][gone] = average(picture, confidence)[gone]
-
-
-def _pull_behind(
-    residuals: Iterable[tuple[int, Array]],
-    estimates: Array,
-    confidence: Array,
-    weight: Array | None,
-    samples: SampleRange | None,
-) -> Iterator[tuple[int, Array]]:
-    """Yield strips of residuals; when one has been used, pull its estimates to the centre's and add to the range.
-
-    Neighbours are averaged before that: the samples stay as they are.
-    """
-    for top, strip in residuals:
-        yield top, strip
-        if weight is not None:
-            pull_to_centre(estimates, confidence, weight, slice(top, top + strip.shape[1]))
-        if samples is not None:
-            samples.add(estimates, strip, top)

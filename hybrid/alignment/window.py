@@ -14,7 +14,7 @@ from hybrid.alignment.prepare import Brightness, PreparedFrame
 from hybrid.alignment.residual import Limited, warp_residual
 from hybrid.files.frame import Array
 from loops.parallel import Mask
-from nlm.pooling import PooledSamples, SampleRange, find_range, pool_samples
+from nlm.pooling import PooledSamples, pool_samples
 from nlm.samples import SampleMean
 from nlm.variance import prefilter_noisy_rows, smooth_variance, variance_from_window
 
@@ -193,7 +193,6 @@ class AlignedWindow:
     # (T, h, W, 3): the first pass, aligned, as irradiance; the centre's where a frame shows nothing, pulled to it where
     # the light drifts
     first_pass: Array | None = None
-    known_range: SampleRange | None = None  # `sample_range`, where it was found along the way
     outliers: int = 0  # samples of the window, within `inner`, rejected as fireflies
 
     @cached_property
@@ -258,14 +257,6 @@ class AlignedWindow:
             for whole, part in zip(pooled, strip, strict=True):
                 whole[rows] = part
         return pooled
-
-    @property
-    def sample_range(self) -> SampleRange:
-        """Range of the first passes and the samples of all frames; of windows with a first pass."""
-        if self.known_range is not None:
-            return self.known_range
-        assert self.first_pass is not None
-        return find_range(self.first_pass, self.sources.residual_strips())
 
     @property
     def middle(self) -> int:

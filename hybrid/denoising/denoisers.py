@@ -16,7 +16,6 @@ class WindowDenoiser(Protocol):
     """A denoiser of aligned windows. Callers use nothing else, and never ask for the class."""
 
     needs_first_pass: ClassVar[bool] = True  # whether windows must hold a first pass
-    clamps: bool = False  # whether results are clamped to `AlignedWindow.sample_range`
     guided: bool = True  # whether `AlignedWindow.guide` or its confidence by geometry is read where there are no AOVs
     reads_guides: bool = True  # whether windows' guides, or samples beside first passes, are read
     packages: ClassVar[tuple[str, ...]] = ()  # packages that pixels depend on

@@ -211,8 +211,8 @@ class FrameDenoiser:
         for band in bands:
             assert window is not None
             # A denoiser may be a plain function.
-            ranged, guided = getattr(self.denoise, "clamps", False), getattr(self.denoise, "guided", True)
-            aligned = [align(window, band, ranged=ranged, guided=guided, timings=stream.timings)]
+            guided = getattr(self.denoise, "guided", True)
+            aligned = [align(window, band, guided=guided, timings=stream.timings)]
             if band is bands[-1]:
                 window = None  # frees its composed flows while the denoiser runs
             stream.keeper.trim()

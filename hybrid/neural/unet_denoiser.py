@@ -20,7 +20,7 @@ from network.robust_average import UNetWindow, pool
 from network.robust_unet import MIRRORED, RobustUNet, for_inference
 from network.unet import Borders
 from nlm.average import average
-from nlm.pooling import PooledSamples, clamp_to_range
+from nlm.pooling import PooledSamples
 
 # Bytes for each pixel of a tile in bfloat16, by the size of the backbone; measured.
 SCRATCH = {"none": 0, "small": 100, "base": 150, "large": 250}
@@ -43,7 +43,6 @@ class UNetDenoiser(NetworkDenoiser):
 
     def __init__(self, model: RobustUNet, setup: Setup) -> None:
         super().__init__(for_inference(model, setup.bfloat16), setup, SCRATCH[model.config.size])
-        self.clamps = model.backbone is not None
         self.reads_guides = model.backbone is not None or setup.breakdown is not None
         self.guided = setup.breakdown is not None or (model.config.clean_guides and not has_oidn_networks())
 
@@ -58,19 +57,15 @@ class UNetDenoiser(NetworkDenoiser):
             weights = self._weigh(aligned)
             guides = clean_guides(aligned) if self.model.config.clean_guides else aligned.centre.guides
             inputs = _Inputs(self._pool(aligned, weights), guides, weights)
-            clamps = self._pools(aligned)  # an average is within the range of what it averages
             if self.setup.breakdown is None:
                 # The samples are pooled: the aligned first passes are freed while the network runs.
-                known_range = aligned.sample_range if clamps else None
-                aligned = replace(aligned, first_pass=None, known_range=known_range)
+                aligned = replace(aligned, first_pass=None)
         with self.setup.timings.stage("network"):
             # `measure_exposure` returns 1 for an image without light, as far as numbers go.
             assert aligned.centre.first_pass is not None
             black = aligned.centre.first_pass.max() < 1 and measure_exposure(aligned.centre.first_pass) == 1
             nothing = np.empty((*aligned.centre.irradiance.shape[:2], 0), np.float32)
             result = self._run(aligned, inputs, nothing, bool(black))
-            if clamps:
-                result = result._replace(irradiance=clamp_to_range(result.irradiance, aligned.sample_range))
             filtered = filter_aovs(aligned, result.irradiance)
             shared = share_out(aligned, filtered, result.irradiance, add=self.setup.add_layers)
             return Denoised(shared.color, shared.aovs, self._count_parts(aligned, result), shared.parts)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from nlm.pooling import clamp_to_range, find_range, pool_samples
+from nlm.pooling import pool_samples
 
 
 @pytest.fixture
@@ -126,23 +126,3 @@ def test_bad_arguments_are_errors(window) -> None:
     for exposure in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(ValueError, match="exposure: expected a positive number"):
             pool_samples(estimates, residuals, confidence, exposure)
-
-
-def test_a_picture_is_held_to_the_range_of_its_window(window) -> None:
-    estimates, residuals, _ = window
-    rng = np.random.default_rng(3)
-    picture = rng.normal(0, 20, estimates.shape[1:]).astype(np.float32)
-    held = clamp_to_range(picture, find_range(estimates, [(0, residuals)]))
-    both = np.concatenate([estimates, estimates + residuals])
-    for y, x, c in np.ndindex(picture.shape):
-        near = both[:, max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2, c]
-        assert held[y, x, c] == np.clip(picture[y, x, c], near.min(), near.max())
-    np.testing.assert_array_equal(clamp_to_range(estimates[2], find_range(estimates, [(0, residuals)])), estimates[2])
-
-
-def test_the_range_of_a_window_leaves_out_what_is_not_finite(window) -> None:
-    estimates, residuals, _ = window
-    expected = clamp_to_range(10 * estimates[2], find_range(estimates, [(0, residuals)]))
-    spoiled = np.concatenate([estimates, np.full_like(estimates[:1], np.inf), np.full_like(estimates[:1], np.nan)])
-    more = np.concatenate([residuals, np.zeros_like(residuals[:2])])
-    np.testing.assert_array_equal(clamp_to_range(10 * estimates[2], find_range(spoiled, [(0, more)])), expected)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from hybrid.alignment.align import align
 from hybrid.alignment.measure import least_outline_noise
@@ -112,32 +111,6 @@ def test_detail_that_all_neighbours_lack_takes_their_confidence(tmp_path):
     assert neighbours[..., :16].max() < 0.1
     assert neighbours[..., 44:].min() > 0.5
     assert aligned.confidence[2].min() == 1
-
-
-@pytest.mark.parametrize("stages", [{"blend-samples"}, {"blend-samples", "drift"}, {"drift"}])
-def test_the_range_of_the_samples_is_found_while_they_are_averaged(stages, tmp_path):
-    """By the first pass as it is afterwards, pulled to the centre's."""
-
-    def brighter(light, index):
-        light = light.copy()
-        light[:, 40:] *= np.float32(1 + 0.1 * index)  # what changes as a whole does not drift
-        return light
-
-    def brighten(index, layers):
-        layers["ViewLayer.Combined"] = brighter(layers["ViewLayer.Combined"], index)
-
-    scene = replace(SCENE, height=160, step=(0, 0))  # strips of 64 rows
-    light = scene.clean(0)["ViewLayer.Combined"]
-    source = PerFrame(lambda frame: brighter(light, frame.number - SCENE.first))
-    shot = open_shot(scene.write(tmp_path, edit=brighten))
-    window = FrameStream(shot, only({"warp", *stages}), first_pass=source).window(MIDDLE)
-    plain, ranged = (align(window, ranged=ranged) for ranged in (False, True))
-    lowest = ranged.first_pass.min(axis=0)
-    assert ("drift" in stages) == bool((lowest > light * np.float32(1.01)).any())
-    for found, expected in zip(ranged.sample_range, plain.sample_range, strict=True):
-        np.testing.assert_array_equal(found, expected)
-    assert plain.known_range is None
-    assert (ranged.known_range is None) == ("blend-samples" not in stages)
 
 
 def test_samples_keep_their_light_where_the_albedo_has_their_noise(tmp_path):
