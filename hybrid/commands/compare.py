@@ -3,7 +3,7 @@
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
@@ -23,7 +23,6 @@ from hybrid.comparison.methods import external as finished
 from hybrid.comparison.results import Comparison, Cost, join, read_comparison
 from hybrid.comparison.running import run_in_process
 from hybrid.comparison.store import FrameStore
-from hybrid.comparison.sweep import CLASSICAL, NETWORK, sweep_methods
 from hybrid.comparison.tables import ladder_rows, ladder_table, markdown_rows, markdown_table, result_table
 from hybrid.denoising.stream import plan_shot
 from hybrid.files.movies import check_movie
@@ -105,7 +104,6 @@ def compare(
     methods: str | None = None,
     external: list[str] | None = None,
     external_seconds: list[str] | None = None,
-    sweep: bool = False,
     rounds: int = 3,
     samples: float | None = None,
     level: list[str] | None = None,
@@ -135,10 +133,6 @@ def compare(
     if ladder:
         levels = [(validate_renders({"level": found}, strict=strict)[0]["level"], count) for found, count in levels]
     chosen = _methods(methods, external, _seconds(external_seconds), noisy, read.frames)
-    plan = cache(partial(run_in_process, plan_shot, noisy))
-    if sweep:
-        LOG.info("plan the shot")
-        chosen |= {base: METHODS[base] for base in (CLASSICAL, NETWORK)} | sweep_methods(plan())
     options = CompareOptions(
         title=name or (Path(shot) if Path(shot).is_dir() else Path(shot).parent).resolve().name,
         exposure=exposure,
@@ -148,7 +142,9 @@ def compare(
         levels=levels,
         ladder=ladder,
         findings=findings,
-        check_shot=lambda: [finding.message for finding in log_cuts(plan(), (), strict=strict)],
+        check_shot=lambda: [
+            finding.message for finding in log_cuts(run_in_process(plan_shot, noisy), (), strict=strict)
+        ],
         maps=report.output is not None,
     )
     reuse_freed_memory()

@@ -62,8 +62,7 @@ def families(results: Sequence[MethodResult]) -> list[str]:
 def draw_chart(results: Sequence[MethodResult], metric: Metric, cost: Cost, *, legend: bool = False) -> Figure | None:
     """Draw the chart, better up, cost on a logarithmic axis; None if no method has a finite value.
 
-    Groups of the SVG are named for the page's script: ``point-i``, ``bar-i`` and ``name-i`` belong to result i,
-    ``series-f`` to family f.
+    Groups of the SVG are named for the page's script: ``point-i``, ``bar-i`` and ``name-i`` belong to result i.
     """
     shown = {i: r for i, r in enumerate(results) if _is_drawable(r, metric)}
     if not shown:
@@ -80,7 +79,7 @@ def draw_chart(results: Sequence[MethodResult], metric: Metric, cost: Cost, *, l
     points = [_Point(i, r, places[i], heights[i], names.index(r.family), r.name in front) for i, r in shown.items()]
     for point in points:
         _draw_point(axes, point, metric, cost)
-    _draw_lines(axes, points)
+    _draw_front(axes, points)
     if legend:
         _draw_legend(figure, names)
     _draw_labels(figure, axes, points, metric)
@@ -152,7 +151,7 @@ def _leave_out_input(axes: Axes, shown: Collection[MethodResult], metric: Metric
 
 
 def _draw_point(axes: Axes, point: _Point, metric: Metric, cost: Cost) -> None:
-    """Marker and error bars of a method: filled on the front, smaller for a point of a sweep."""
+    """Marker and error bars of a method: filled on the front."""
     result, statistic = point.result, point.result.metrics[metric.key]
     color, kind, size = _style(point.family)
     bars = [((point.x, point.x), (statistic.low, statistic.high))]
@@ -166,7 +165,7 @@ def _draw_point(axes: Axes, point: _Point, metric: Metric, cost: Cost) -> None:
         [point.y],
         linestyle="none",
         marker=kind,
-        markersize=((6 if result.sweep else 8) + point.on_front) * size,
+        markersize=(8 + point.on_front) * size,
         markerfacecolor=color if point.on_front else "white",
         markeredgecolor="white" if point.on_front else color,
         markeredgewidth=0.8 if point.on_front else 1.4,
@@ -176,32 +175,20 @@ def _draw_point(axes: Axes, point: _Point, metric: Metric, cost: Cost) -> None:
     )
 
 
-def _draw_lines(axes: Axes, points: Sequence[_Point]) -> None:
-    """The steps of the front, and a line through the points of each sweep that varies one number."""
+def _draw_front(axes: Axes, points: Sequence[_Point]) -> None:
     front = sorted((p.x, p.y) for p in points if p.on_front)
     if front:
         xs, ys = zip(*front, (axes.get_xlim()[1], front[-1][1]), strict=True)
         axes.step(xs, ys, where="post", color="black", linewidth=1.1, alpha=0.8, zorder=2)
-    sweeps: dict[tuple[str, str], list[tuple[float, _Point]]] = {}
-    for p in points:
-        value, *others = [*p.result.settings.values(), None]
-        if p.result.sweep and others == [None] and isinstance(value, (int, float)):
-            sweeps.setdefault((p.result.sweep, p.result.base), []).append((value, p))
-    for group in sweeps.values():
-        line = [p for _, p in sorted(group, key=lambda pair: pair[0])]
-        gid, (color, *_) = f"series-{line[0].family}", _style(line[0].family)
-        axes.plot([p.x for p in line], [p.y for p in line], color=color, linewidth=0.8, alpha=0.6, gid=gid)
 
 
 def _draw_labels(figure: Figure, axes: Axes, points: Sequence[_Point], metric: Metric) -> None:
-    """Names of all points, the front's first, farther off where it is crowded; of a sweep's those on the front only."""
+    """Names of all points, the front's first, farther off where it is crowded."""
     figure.draw_without_rendering()
     pixels = [axes.transData.transform((p.x, p.y)) for p in points]
     taken = [Bbox.from_bounds(x - 6, y - 6, 12, 12) for x, y in pixels]
     frame = Bbox.from_extents(0, axes.bbox.y0, figure.bbox.width, figure.bbox.height)
-    for p in sorted(points, key=lambda p: (not p.on_front, bool(p.result.sweep), p.x)):
-        if p.result.sweep and not p.on_front:
-            continue
+    for p in sorted(points, key=lambda p: (not p.on_front, p.x)):
         name = " ".join(p.result.name.split())
         if p.y != (mean := p.result.metrics[metric.key].mean):
             name += f" {format_value(mean, metric)}, off the scale"
@@ -237,7 +224,7 @@ def draw_curves(
 
     `frames` are the numbers of the frames; a measure of pairs of frames has a value less, at the later one.
     """
-    drawn = [r for r in results if metric.key in r.metrics and not r.sweep and r.family != INPUT_FAMILY]
+    drawn = [r for r in results if metric.key in r.metrics and r.family != INPUT_FAMILY]
     series = {r.name: r.metrics[metric.key].values for r in drawn}
     length = max(map(len, series.values()), default=0)
     if length < 3:

@@ -8,7 +8,6 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from hybrid.comparison.evaluation import Evaluator, Level, find_static_pixels, mean_error, store_flows, store_reference
 from hybrid.comparison.ladder import build_ladder
@@ -83,7 +82,7 @@ def compare_shot(
         results = [
             _measured(name, method, timed.runs[name], statistics[name], law, static.size / 1e6)
             if name in timed.runs
-            else MethodResult(name, **_asked(method), absent_reason=timed.absent[name])
+            else MethodResult(name, method.settings, method.family, absent_reason=timed.absent[name])
             for name, method in methods.items()
         ]
         ladder = _measure_ladder(evaluator, methods, statistics, options, on_step)
@@ -173,16 +172,14 @@ def _span(numbers: Sequence[int]) -> str:
 
 
 def _evaluate(evaluator: Evaluator, methods: Mapping[str, Method], on_step: OnStep) -> dict[str, dict[str, Statistic]]:
-    """Measures of each method; without FLIP for points of a sweep."""
     on_step("FLIP of all methods")
-    evaluator.map_flip([name for name, method in methods.items() if not method.sweep])
+    evaluator.map_flip(list(methods))
     evaluator.map_changes(REFERENCE)  # true changes, which are no flicker
     statistics = {}
-    for name, method in methods.items():
+    for name in methods:
         on_step(f"measure {name}")
-        statistics[name] = evaluator.measure(name, flip=not method.sweep)
-        if not method.sweep:
-            evaluator.map_changes(name)
+        statistics[name] = evaluator.measure(name)
+        evaluator.map_changes(name)
     return statistics
 
 
@@ -199,8 +196,8 @@ def _noise_law(
 
 
 def _methods_of_levels(methods: Mapping[str, Method]) -> dict[str, Method]:
-    """The methods that run on levels: finished frames show the shot alone, and sweeps would take days."""
-    return {name: method for name, method in methods.items() if method.given is None and not method.sweep}
+    """The methods that run on levels: finished frames show the shot alone."""
+    return {name: method for name, method in methods.items() if method.given is None}
 
 
 def _measure_ladder(
@@ -221,13 +218,8 @@ def _measure_ladder(
         timed = time_methods(at_level, level, 1, evaluator.store, on_step)
         on_step(f"measure the level of {samples:g} samples")
         evaluator.map_flip(list(timed.runs))
-        measured[samples] = {names[long]: evaluator.measure(long, flip=True) for long in timed.runs}
+        measured[samples] = {names[long]: evaluator.measure(long) for long in timed.runs}
     return build_ladder(measured)
-
-
-def _asked(method: Method) -> dict[str, Any]:
-    """Fields of a method that its result has too."""
-    return {name: getattr(method, name) for name in ("settings", "family", "sweep", "base")}
 
 
 def _measured(
@@ -244,7 +236,8 @@ def _measured(
     stated = unmeasured if method.seconds is None else method.seconds / megapixels
     return MethodResult(
         name,
-        **_asked(method),
+        method.settings,
+        method.family,
         seconds_per_megapixel=seconds.median if seconds else stated,
         spread=(seconds.least, seconds.most) if seconds and len(runs) > 1 else None,
         cpu_seconds_per_megapixel=seconds.cpu if seconds else unmeasured,

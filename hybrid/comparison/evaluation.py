@@ -66,8 +66,8 @@ class Evaluator:
             with ThreadPoolExecutor(AT_ONCE) as threads:
                 list(threads.map(partial(self._map_change, name), self.numbers))
 
-    def measure(self, name: str, *, flip: bool) -> dict[str, Statistic]:
-        """Measure frames, by `map_flip` too if `flip`; over time only with pairs of frames or static pixels."""
+    def measure(self, name: str) -> dict[str, Statistic]:
+        """Measure frames, after `map_flip`; over time only with pairs of frames or static pixels."""
         values: dict[str, list[float]] = {key: [] for key in (*MEASURES, "flip", "temporal_psnr")}
 
         def measure_frame(number: int) -> dict[str, float]:
@@ -79,9 +79,8 @@ class Evaluator:
                 for key, value in measured.items():
                     values[key].append(value)
             values["temporal_psnr"] += threads.map(partial(self._measure_pair, name), self.pairs)
-        if flip:
-            maps = (self.store.load(name, number, FLIP_MAP) for number in self.numbers)
-            values["flip"] += [float(errors.mean(dtype=np.float64)) for errors in maps]
+        maps = (self.store.load(name, number, FLIP_MAP) for number in self.numbers)
+        values["flip"] += [float(errors.mean(dtype=np.float64)) for errors in maps]
         if self.static.any():
             frames = (self.store.load(name, number) for number in self.numbers)
             values["static_std"] = list(metrics.static_std(frames, self.static, exposure=self.exposure))

@@ -3,12 +3,10 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from flow.tvl1 import refine_flow
-from hybrid.alignment.guides import GuideFilter
 from hybrid.alignment.window import AlignedWindow
 from hybrid.denoising.first_pass import (
     NETWORKS,
@@ -45,14 +43,9 @@ class Method:
     maps: Maps | None = None
     # "measured"; "free": the frames exist before any method runs; "unknown": another program made the frames
     cost: Literal["measured", "free", "unknown"] = "measured"
-    threads: int = 0  # limit on the number of threads; 0: no limit
     seconds: float | None = None  # per frame, of "unknown" cost, as its user states them
     given: Shot | None = None  # frames that another denoiser has written: they are checked before any method runs
-    # shown in the report; in a sweep, the settings that differ from those of `base`
-    settings: Mapping[str, object] = field(default_factory=dict)
-    # the setting that is varied, and the method that is varied
-    sweep: str = ""
-    base: str = ""
+    settings: Mapping[str, object] = field(default_factory=dict)  # shown in the report
 
 
 def noisy(shot: Frames) -> Iterator[tuple[int, Array]]:
@@ -73,90 +66,71 @@ def external(other: Shot, seconds: float | None = None) -> Method:
     return Method(partial(finished, other=other), "External", cost="unknown", seconds=seconds, given=other)
 
 
-@dataclass(frozen=True)
-class WindowSettings:
-    """How windows are aligned: radius, source of the first pass, forced stages, vectors, settings of TV-L1."""
+def _stream(shot: Frames, first_pass: str, denoiser: "NetworkDenoiser | None" = None) -> FrameStream:
+    """The windows of a shot, with the first pass of this name, as a network reads them or without one."""
+    backends = Backends()
+    if first_pass == "bundled":
+        from hybrid.neural import denoise_bundled  # torch may be absent
 
-    radius: int = 2
-    source: str = "none"
-    rules: Rules = field(default_factory=Rules)
-    vectors: bool = True  # whether the renderer's are read
-    solver: Mapping[str, Any] = field(default_factory=dict)  # of TV-L1, which runs then
-
-    def stream(self, shot: Frames, filter_guides: GuideFilter | None = None, reads_guides: bool = True) -> FrameStream:
-        frames = shot
-        if not self.vectors:
-            frames = MappedShot(shot, lambda frame: replace(frame, motion=None, motion_convention=None))
-        rules = replace(self.rules, on=self.rules.on | {"refine"}) if self.solver else self.rules
-        backends = Backends()
-        if self.source == "bundled":
-            from hybrid.neural import denoise_bundled  # torch may be absent
-
-            backends = Backends(bundled=denoise_bundled)
-        chosen = named_first_pass(self.source, mode=OIDN_MODE_OF_NETWORKS, backends=backends)
-        refine = partial(refine_flow, **self.solver)
-        return FrameStream(
-            frames,
-            rules,
-            chosen.first_pass,
-            radius=self.radius,
-            refine=refine,
-            filter_guides=filter_guides,
-            reads_guides=reads_guides,
-        )
+        backends = Backends(bundled=denoise_bundled)
+    source = named_first_pass(first_pass, mode=OIDN_MODE_OF_NETWORKS, backends=backends)
+    if denoiser is None:
+        return FrameStream(shot, Rules(), source.first_pass)
+    return FrameStream(
+        shot,
+        Rules(),
+        source.first_pass,
+        radius=denoiser.radius,
+        filter_guides=denoiser.filter_guides,
+        reads_guides=denoiser.reads_guides,
+    )
 
 
 @dataclass(frozen=True)
 class Classical:
     denoise: WindowFilter
-    window: WindowSettings = field(default_factory=WindowSettings)
+    first_pass: str = "none"
 
     def __call__(self, shot: Frames) -> Iterator[tuple[int, Array]]:
-        stream = self.window.stream(shot)
+        stream = _stream(shot, self.first_pass)
         for number in shot.numbers:
             denoised, frame = self.denoise(stream.align(number)), stream.frame(number)
             assert frame is not None
             yield number, frame.with_filter(denoised)
 
     def maps(self, shot: Frames, numbers: Sequence[int]) -> Iterator[tuple[int, dict[str, Array]]]:
-        stream = self.window.stream(shot)
+        stream = _stream(shot, self.first_pass)
         for number in numbers:
             yield number, window_maps(stream.align(number), self.denoise)
 
 
 @dataclass(frozen=True)
 class Network:
-    """Denoise with a preset's weights and windows of its radius; others are options of `hybrid.neural.open_network`."""
+    """Denoise with the weights of a preset, and windows of its radius."""
 
     preset: str
-    window: WindowSettings = field(default_factory=WindowSettings)
-    tile: int | None = None
-    precision: str = "auto"
-    threshold: float | None = None
+    first_pass: str = "none"
 
     def __call__(self, shot: Frames) -> Iterator[tuple[int, Array]]:
-        denoiser = _denoiser(self.preset, self.tile, self.precision, self.threshold)
-        frames = FrameDenoiser(self._stream(shot, denoiser), denoiser)
+        denoiser = _denoiser(self.preset, "auto")
+        frames = FrameDenoiser(_stream(shot, self.first_pass, denoiser), denoiser)
         for number in shot.numbers:
             yield number, frames.make(number).denoised.color
 
     def maps(self, shot: Frames, numbers: Sequence[int]) -> Iterator[tuple[int, dict[str, Array]]]:
         """Yield number and `window_maps` of some frames, in float32: differences of runs must exceed rounding."""
-        denoiser = _denoiser(self.preset, None, "float32", None)
-        stream = self._stream(shot, denoiser)
+        denoiser = _denoiser(self.preset, "float32")
+        stream = _stream(shot, self.first_pass, denoiser)
         for number in numbers:
             yield number, window_maps(stream.align(number), lambda window: denoiser(window).color)
 
-    def _stream(self, shot: Frames, denoiser: "NetworkDenoiser") -> FrameStream:
-        return replace(self.window, radius=denoiser.radius).stream(shot, denoiser.filter_guides, denoiser.reads_guides)
-
 
 @lru_cache(maxsize=1)
-def _denoiser(preset: str, tile: int | None, precision: str, threshold: float | None) -> "NetworkDenoiser":
+def _denoiser(preset: str, precision: str) -> "NetworkDenoiser":
     """A network with the weights of a preset, loaded once."""
     from hybrid import neural  # torch may be absent
 
-    return neural.open_network(neural.find_weights(preset), tile=tile, precision=precision, threshold=threshold)
+    return neural.open_network(neural.find_weights(preset), precision=precision)
 
 
 def aligned_average(aligned: AlignedWindow) -> Array:
@@ -206,15 +180,15 @@ def oidn_then_average(shot: Frames) -> Iterator[tuple[int, Array]]:
         yield number, aligned_robust_average(stream.align(number))
 
 
-def _aligned(family: str, denoise: WindowFilter, source: str = "none", **settings: object) -> Method:
-    run = Classical(denoise, WindowSettings(source=source))
-    first_pass = {} if source == "none" else {"first pass": source}
-    return Method(run, family, run.maps, settings={"window": 2 * run.window.radius + 1, **first_pass, **settings})
+def _aligned(family: str, denoise: WindowFilter, first_pass: str = "none", **settings: object) -> Method:
+    run = Classical(denoise, first_pass)
+    named = {} if first_pass == "none" else {"first pass": first_pass}
+    return Method(run, family, run.maps, settings={"window": 5, **named, **settings})
 
 
-def _network(preset: str, source: str) -> Method:
-    run = Network(preset, WindowSettings(source=source))
-    return Method(run, "Networks", run.maps, settings={"weights": preset, "first pass": source})
+def _network(preset: str, first_pass: str) -> Method:
+    run = Network(preset, first_pass)
+    return Method(run, "Networks", run.maps, settings={"weights": preset, "first pass": first_pass})
 
 
 def _oidn(quality: Quality, prefilter: Quality | None = None) -> Method:
@@ -237,9 +211,9 @@ METHODS: dict[str, Method] = {
     "aligned average": _aligned("Averages", aligned_average),
     "aligned robust average": _aligned("Averages", aligned_robust_average),
     **_CLASSICAL,
-    "gated": _aligned("Gated averages", gated_average, source="nlm"),
-    "gated OIDN fast": _aligned("Gated averages", gated_average, source="oidn-fast"),
-    "gated OIDN": _aligned("Gated averages", gated_average, source="oidn"),
+    "gated": _aligned("Gated averages", gated_average, first_pass="nlm"),
+    "gated OIDN fast": _aligned("Gated averages", gated_average, first_pass="oidn-fast"),
+    "gated OIDN": _aligned("Gated averages", gated_average, first_pass="oidn"),
     "fast without OIDN": _network("fast", "bundled"),
     **{preset: _network(preset, OIDN_MODE_OF_NETWORKS) for preset in NETWORKS},
     "RA": _network("ra", "none"),

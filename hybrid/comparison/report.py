@@ -31,7 +31,6 @@ from hybrid.comparison.results import (
     pareto_front,
     present_metrics,
     read_comparison,
-    stage_values,
     to_document,
     to_json,
     to_plain_numbers,
@@ -92,14 +91,14 @@ def check_report(folder: Path, inputs: Sequence[Path] = ()) -> None:
 def report_images(
     store: FrameStore, comparison: Comparison, frames: Sequence[int], exposure: float = 1.0
 ) -> ShotImages:
-    """Return the images that `compare_shot` has stored; points of sweeps are left out: they are many and look alike."""
+    """Return the images that `compare_shot` has stored."""
 
     def load_map(name: str, title: str, number: int) -> Array | None:
         return store.load(name, number, title) if store.has(name, number, title) else None
 
     methods = []
     for result in comparison.results:
-        if result.absent_reason is None and not result.sweep:
+        if result.absent_reason is None:
             titles = [t for t in MAP_TITLES if any(store.has(result.name, number, t) for number in frames)]
             maps = {title: partial(load_map, result.name, title) for title in titles}
             methods.append(MethodImages(result.name, partial(store.load, result.name), maps))
@@ -146,10 +145,8 @@ def _page(
         colors=chart.COLORS,
         marker=chart.marker,
         plots=[_plot(results, m, c, f"chart{i}") for i, (m, c) in enumerate((m, c) for m in charted for c in costs)],
-        methods=_method_table([r for r in present if not r.sweep], metrics),
+        methods=_method_table(present, metrics),
         absent=[r for r in results if r.absent_reason is not None],
-        sweeps=_sweep_tables(present, metrics),
-        stages=stage_values(results),
         ladder=None if (ladder := chart.draw_ladder(comparison.ladder)) is None else chart.to_svg(ladder, "ladder"),
         ladder_rows=tables.ladder_rows(comparison.ladder),
         shots=_shot_table([comparison, *report.others]),
@@ -242,26 +239,15 @@ def _columns(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> list
 
 
 class MethodTable(NamedTuple):
-    """Methods by family, the measures as columns, and the number of methods that are points of a sweep."""
+    """Methods by family, and the measures as columns."""
 
     columns: list[Column]
     families: dict[str, list[MethodResult]]
-    varied: int
 
 
 def _method_table(results: Sequence[MethodResult], metrics: Sequence[Metric]) -> MethodTable:
     families = {name: [r for r in results if r.family == name] for name in chart.families(results)}
-    return MethodTable(_columns(results, metrics), families, sum(bool(r.sweep) for r in results))
-
-
-def _sweep_tables(present: Sequence[MethodResult], metrics: Sequence[Metric]) -> dict[str, MethodTable]:
-    """The points of each sweep, below the methods that they vary."""
-    tables = {}
-    for sweep in dict.fromkeys(r.sweep for r in present if r.sweep):
-        members = [r for r in present if r.sweep == sweep]
-        bases = [r for r in present if not r.sweep and r.name in {m.base for m in members}]
-        tables[sweep] = _method_table([*bases, *members], metrics)
-    return tables
+    return MethodTable(_columns(results, metrics), families)
 
 
 class ShotTable(NamedTuple):

@@ -44,13 +44,11 @@ class Metric:
 
 @dataclass(frozen=True)
 class MethodResult:
-    """Accuracy and cost of one method, with one choice of settings, on a shot."""
+    """Accuracy and cost of one method on a shot."""
 
     name: str
-    settings: Mapping[str, object] = field(default_factory=dict)  # in a sweep, those that differ from those of `base`
+    settings: Mapping[str, object] = field(default_factory=dict)
     family: str = "Methods"  # methods of one family share color and marker on the chart
-    sweep: str = ""  # the setting that is varied; "" outside sweeps
-    base: str = ""  # the method that is varied
     # median of the runs; 0 for frames that existed before, None where unknown
     seconds_per_megapixel: float | None = None
     spread: tuple[float, float] | None = None  # least and greatest seconds per megapixel of repeated runs
@@ -103,12 +101,12 @@ def summarize(values: Sequence[float], shots: Sequence[int] = ()) -> Statistic:
 
 
 def join(comparisons: Sequence[Comparison]) -> list[MethodResult]:
-    """Join the results of several shots: methods measured on all of them, without points of sweeps.
+    """Join the results of several shots: methods measured on all of them.
 
     Measures are means over shots, with intervals over shots and frames. Times are means too (shots need different
     stages), memory is the maximum, worth the geometric mean.
     """
-    tables = [{r.name: r for r in c.results if r.absent_reason is None and not r.sweep} for c in comparisons]
+    tables = [{r.name: r for r in c.results if r.absent_reason is None} for c in comparisons]
     common = [name for name in tables[0] if all(name in table for table in tables)] if tables else []
     return [_join_method([table[name] for table in tables]) for name in common]
 
@@ -156,14 +154,14 @@ def leading_pair(results: Sequence[MethodResult], metric: Metric) -> tuple[str, 
     """Name the best method and its strongest rival; None where fewer than two methods have a mean.
 
     For a method of ours the rival is the best of `OTHER_FAMILIES`, for one of those the best of ours, and of any family
-    where the other side has none. Points of sweeps and the noisy input are rivals only where nothing else is.
+    where the other side has none. The noisy input is a rival only where nothing else is.
     """
     rated = [r for r in results if metric.key in r.metrics and not math.isnan(r.metrics[metric.key].mean)]
     best, _ = best_and_ties(rated, metric)
     leader = next((r for r in rated if r.name == best), None)
     if leader is None:
         return None
-    denoisers = [r for r in rated if r.family != INPUT_FAMILY and not r.sweep]
+    denoisers = [r for r in rated if r.family != INPUT_FAMILY]
     is_other = leader.family in OTHER_FAMILIES
     for rivals in ([r for r in denoisers if (r.family in OTHER_FAMILIES) != is_other], denoisers, rated):
         rival, _ = best_and_ties([r for r in rivals if r.name != leader.name], metric)
@@ -190,49 +188,12 @@ def pareto_front(results: Sequence[MethodResult], metric: Metric, cost: Cost) ->
     return front
 
 
-@dataclass(frozen=True)
-class StageValue:
-    """Effect of one stage: measures with the stage minus measures without it."""
-
-    stage: str
-    base: str
-    on: bool  # in the plan
-    gains: Mapping[str, float]  # by the keys of `MARKDOWN_METRICS`
-    significant: tuple[str, ...]  # keys of the gains that are no tie
-    seconds: float | None
-    cpu_seconds: float | None
-
-
 def opening_pair(results: Sequence[MethodResult], metric: Metric) -> tuple[str, str] | None:
     """Name the noisy input and the best method of ours, or else the best of all, with which a page opens."""
-    ours = [r for r in results if r.family not in (INPUT_FAMILY, *OTHER_FAMILIES) and not r.sweep]
+    ours = [r for r in results if r.family not in (INPUT_FAMILY, *OTHER_FAMILIES)]
     shown = best_and_ties(ours, metric)[0] or best_and_ties(results, metric)[0]
     noisy = next((r.name for r in results if r.family == INPUT_FAMILY and r.name != shown), None)
     return None if noisy is None or shown is None else (noisy, shown)
-
-
-def stage_values(results: Sequence[MethodResult]) -> list[StageValue]:
-    """Compute the effect of each stage from the points of the sweep "Stages"."""
-    by_name = {r.name: r for r in results if r.absent_reason is None}
-    values = []
-    for variant in by_name.values():
-        base = by_name.get(variant.base)
-        if variant.sweep != "Stages" or base is None:
-            continue
-        ((stage, state),) = variant.settings.items()
-        on = state == "off"  # the sweep inverts the plan
-        having, lacking = (base, variant) if on else (variant, base)
-        pairs = {
-            key: (having.metrics[key], lacking.metrics[key])
-            for key in MARKDOWN_METRICS
-            if key in having.metrics and key in lacking.metrics
-        }
-        gains = {key: a.mean - b.mean for key, (a, b) in pairs.items()}
-        significant = tuple(key for key, pair in pairs.items() if not _tied(*pair))
-        costs = [(getattr(having, name), getattr(lacking, name)) for name in list(COSTS)[:2]]
-        spent = (None if None in cost else cost[0] - cost[1] for cost in costs)
-        values.append(StageValue(str(stage), base.name, on, gains, significant, *spent))
-    return values
 
 
 def _goodness(value: float, metric: Metric) -> float:
@@ -261,7 +222,7 @@ def settings_as_text(result: MethodResult) -> dict[str, str]:
 
 
 def to_document(comparison: Comparison) -> dict[str, object]:
-    """Return the content of ``results.json`` as plain dicts: the comparison, its fronts, the effect of stages."""
+    """Return the content of ``results.json`` as plain dicts: the comparison and its fronts."""
     results, metrics = comparison.results, present_metrics(comparison.results, METRICS)
     return {
         "shot": comparison.shot,
@@ -273,7 +234,6 @@ def to_document(comparison: Comparison) -> dict[str, object]:
             for r in results
         ],
         "fronts": {f"{m.key} {cost}": pareto_front(results, m, cost) for m in metrics for cost in COSTS},
-        "stages": [asdict(s) for s in stage_values(results)],
         "ladder": comparison.ladder,
         "frames": comparison.frames,
     }
@@ -320,7 +280,7 @@ def _read_result(entry: Mapping[str, Any]) -> MethodResult:
     for key, found in entry["metrics"].items():
         numbers = {name: float(found[name]) for name in ("mean", "minimum", "maximum", "low", "high")}
         metrics[key] = Statistic(**numbers, values=tuple(map(float, found["values"])), shots=tuple(found["shots"]))
-    values: dict[str, Any] = {name: str(entry[name]) for name in ("name", "family", "sweep", "base")}
+    values: dict[str, Any] = {name: str(entry[name]) for name in ("name", "family")}
     numbers_or_text = dict.fromkeys(("seconds_per_megapixel", "cpu_seconds_per_megapixel", "worth"), float)
     for name, kind in {**numbers_or_text, "peak_bytes": int, "absent_reason": str}.items():
         values[name] = None if entry[name] is None else kind(entry[name])

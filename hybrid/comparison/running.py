@@ -12,7 +12,7 @@ from hybrid.comparison.store import FrameStore
 from hybrid.files.frame import Frames, cut_middle
 from hybrid.runtime.allocator import reuse_freed_memory
 from hybrid.runtime.system import start_context
-from hybrid.runtime.threads import let_waiting_threads_sleep, limit_threads
+from hybrid.runtime.threads import let_waiting_threads_sleep
 from hybrid.runtime.timing import Stage, Timings
 
 OnStep = Callable[[str], None]  # gets a description of each step as it starts
@@ -62,8 +62,6 @@ def run_method(method: Method, shot: Frames, name: str = "", store: FrameStore |
 
     A crop of the first frame is denoised before the clock starts, which excludes compilation and loading of weights.
     """
-    if method.threads:
-        limit_threads(method.threads)
     next(method.run(cut_middle(shot, WARM_UP)), None)
     pixels, timings = 0, Timings()
     frames = method.run(_TimedFrames(shot, timings))

@@ -139,7 +139,7 @@ def ladder_table(rows: Sequence[Sequence[str]]) -> Table:
 
 def markdown_table(comparisons: Sequence[Comparison], cost: Cost) -> str:
     """Write the README's table: measures on each shot, best bold, ties "≈", and the costs on the first one."""
-    shots = [_Columns.of([r for r in c.results if not r.sweep], MARKDOWN_METRICS) for c in comparisons]
+    shots = [_Columns.of(c.results, MARKDOWN_METRICS) for c in comparisons]
     cpu = cost == "cpu_seconds_per_megapixel"
     heads = [
         f"{c.shot}: {' / '.join(column_title(m) for m, *_ in shot.verdicts)}"

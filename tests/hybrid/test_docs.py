@@ -28,7 +28,7 @@ FOREIGN = {
     "--break", "--source-dir", "--command", "--background", "--render", "--keep", "--replace", "--addons", "--python",
     "--python-exit-code", "--chnames", "--chappend", "--no-deps", "--extra-index-url", "--host", "--port",
     "--nworkers", "--nthreads", "--step", "--nproc-per-node", "--threads", "--system-site-packages", "--upgrade",
-    "--seed", "--compact", "--second-reference", "--sweep", "--part",
+    "--seed", "--compact", "--second-reference", "--part",
 }  # fmt: skip
 
 

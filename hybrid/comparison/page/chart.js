@@ -1,11 +1,11 @@
 // The charts: axes and families are chosen; points show their figures, and send their method to the viewer.
-// Groups of chart i are named chart{i}-point-{j}, -bar-{j} and -name-{j} for result j, and chart{i}-series-{f}.
+// Groups of chart i are named chart{i}-point-{j}, -bar-{j} and -name-{j} for result j.
 
 function startChart(viewer) {
   if (!find("plots")) return;
   for (const point of document.querySelectorAll('.plot [id*="-point-"]')) listenToPoint(point, viewer);
   for (const box of document.querySelectorAll(".legend input")) {
-    box.addEventListener("change", () => showFamily(Number(box.dataset.family), box.dataset.name, box.checked));
+    box.addEventListener("change", () => showFamily(box.dataset.name, box.checked));
   }
   find("axis-up").addEventListener("change", chooseAxes);
   find("axis-over").addEventListener("change", chooseAxes);
@@ -24,11 +24,10 @@ function resultOf(element) {
   return report.results[Number(element.id.split("-").at(-1))];
 }
 
-function showFamily(family, name, visible) {
+function showFamily(name, visible) {
   for (const mark of document.querySelectorAll('.plot :is([id*="-point-"], [id*="-bar-"], [id*="-name-"])')) {
     if (resultOf(mark).family === name) mark.classList.toggle("off", !visible);
   }
-  for (const line of document.querySelectorAll(`.plot [id$="-series-${family}"]`)) line.classList.toggle("off", !visible);
   takeTabStop();
 }
 

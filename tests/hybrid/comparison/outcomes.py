@@ -26,17 +26,3 @@ RESULTS = (
     result("other", 33.0, None, family="External"),
     MethodResult("gone", absent_reason="torch is not installed"),
 )
-
-
-def swept(name: str, psnr: list[float], seconds: float, **settings: Any) -> MethodResult:
-    sweep = "Stages" if next(iter(settings.values())) in ("on", "off") else "Window"
-    return result(name, psnr, seconds, family="Methods", settings=settings, sweep=sweep, base="final")
-
-
-SWEPT = (
-    *RESULTS,
-    swept("without gate", [32.5, 33.0, 33.5], 3.5, gate="off"),  # steadily a decibel less, for half a second less
-    swept("with refine", [33.4, 34.1, 34.4], 9.0, refine="on"),  # scattered about the same
-    swept("window 3", [32.0, 32.5, 33.0], 3.0, window=3),
-    swept("window 1", [29.0, 29.5, 30.0], 2.5, window=1),
-)

@@ -21,7 +21,7 @@ from matplotlib.text import Text
 
 from hybrid.comparison import chart
 from hybrid.comparison.results import MethodResult, Metric
-from tests.hybrid.comparison.outcomes import EVIL, PSNR, RELMSE, RESULTS, SECONDS, SWEPT, result, swept
+from tests.hybrid.comparison.outcomes import EVIL, PSNR, RELMSE, RESULTS, SECONDS, result
 
 
 def draw(results: tuple[MethodResult, ...] | list[MethodResult], metric: Metric = PSNR) -> Figure:
@@ -132,13 +132,6 @@ def test_the_legend_has_every_family_and_as_many_rows_as_it_takes() -> None:
     box = figure.legends[0].get_window_extent()
     assert box.x0 >= 0 and box.x1 <= figure.bbox.width and box.y0 >= 0  # noqa: PT018
     assert figure.bbox.height > small.bbox.height
-
-
-def test_a_line_joins_the_points_of_a_sweep_in_the_order_of_its_number() -> None:
-    figure = draw([*SWEPT, swept("window 5", [33.0, 33.1, 33.2], 3.6, window=5)])
-    ((family, line),) = lines(figure, "series").items()  # stages are no numbers
-    assert chart.families(SWEPT)[family] == "Methods"
-    np.testing.assert_allclose(line.get_xdata(), [2.5, 3.0, 3.6])
 
 
 def test_svg_is_well_formed_whatever_the_names_are() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from hybrid.alignment.window import AlignedWindow
 from hybrid.comparison import methods
-from hybrid.comparison.methods import METHODS, Network, WindowSettings, aligned_average, window_maps
+from hybrid.comparison.methods import METHODS, Network, aligned_average, window_maps
 from hybrid.comparison.metrics import psnr
 from hybrid.denoising.plan import Rules
 from hybrid.denoising.pseudo_reference import filter_window
@@ -122,8 +122,9 @@ def test_a_network_gets_its_guides_filtered_as_in_a_run(shot: Shot, monkeypatch:
             guided.append(aligned.centre.filtered_guides is not None)
             return Denoised(aligned.centre.irradiance * aligned.modulation)
 
+    monkeypatch.setattr(methods, "Rules", lambda: only({"demodulate", "warp", "clean-guides"}))
     monkeypatch.setattr(methods, "_denoiser", lambda *settings: Denoiser())
-    network = Network("quality", WindowSettings(source="nlm", rules=only({"demodulate", "warp", "clean-guides"})))
+    network = Network("quality", "nlm")
     for _ in network(shot):
         assert guided.pop()
     for _ in network.maps(shot, shot.numbers[:1]):

@@ -67,9 +67,7 @@ def write(folder: Path, name: str) -> Outline:
     results = (
         result(""),
         result(" 2"),
-        result(" 3", sweep=name, base=name),
-        result(" 4", sweep="Stages", base=name, settings={name: "off"}),
-        MethodResult(name + " 5", absent_reason=name),
+        MethodResult(name + " 3", absent_reason=name),
     )
     pictures = MethodImages(
         name,

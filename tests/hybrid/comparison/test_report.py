@@ -18,7 +18,7 @@ for _package in ("jinja2", "matplotlib"):
 from hybrid.comparison.embedding import MethodImages, ShotImages
 from hybrid.comparison.report import Report, check_report, write_report
 from hybrid.comparison.results import COSTS, Comparison, Cost, read_comparison
-from tests.hybrid.comparison.outcomes import RESULTS, SWEPT, result
+from tests.hybrid.comparison.outcomes import RESULTS, result
 
 
 def scene(level: float, shape: tuple[int, int] = (18, 32)) -> Callable[[int], np.ndarray]:
@@ -42,17 +42,13 @@ def test_every_file_is_written_and_readable(tmp_path: Path) -> None:
     assert "two cores" in text
 
 
-def test_the_page_shows_stages_sweeps_and_other_shots(tmp_path: Path) -> None:
+def test_the_page_shows_other_shots(tmp_path: Path) -> None:
     other = Comparison("Yard", (result("final", 30.0, 1.0), result("average", 31.0, 1.0)))
-    page = write_report(tmp_path, Report(Comparison("Hall", SWEPT), others=[other]))
+    page = write_report(tmp_path, Report(Comparison("Hall", RESULTS), others=[other]))
     text = page.read_text(encoding="utf-8")
-    assert "Effect of each stage" in text
-    assert "+1.00" in text
-    assert "Sweep of Window: 2 settings" in text
     assert "All shots" in text
     assert "Yard" in text
     alone = write_report(tmp_path, Report(Comparison("Hall", RESULTS))).read_text(encoding="utf-8")
-    assert "Effect of each stage" not in alone
     assert "All shots" not in alone
 
 
