@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -26,20 +25,10 @@ from hybrid.comparison.tables import column_title, format_bytes, format_seconds,
 # Okabe and Ito's palette, which people with any common color blindness can distinguish, without its yellow, which is
 # invisible on white. Seven colors and nine markers: families repeat neither until the 64th.
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6b6b6b")
-MARKERS = "os^D*vXhP"
-SIZES = (1.0, 0.95, 1.1, 0.85, 1.6, 1.1, 1.15, 1.05, 1.15)  # of the markers, for about equal areas
-WIDTH, HEIGHT, PNG_DPI = 10.0, 5.4, 160  # inches, and dots per inch
-GUTTER = 0.09  # of the cost axis: the columns of methods that cost nothing, and of those whose cost is unknown
-LEGEND_COLUMNS, LEGEND_ROW = 4, 0.3  # the height of a row in inches
-LADDER_COLUMNS, LADDER_HEIGHT = 5, 4.0  # of the chart of a ladder; the height in inches
+MARKERS = "osD^vPXhp"
+WIDTH, PNG_DPI = 10.0, 160  # inches, and dots per inch
+LEGEND_ROW = 0.3  # height in inches
 ERRORS = {"psnr": "Squared error", "temporal_psnr": "Squared error of changes"}  # where a measure is not the error
-LONGEST_LABEL = 34
-# Where a label may stand, in order of preference: offset in points, alignment. The front's line leads to a point from
-# below and from it to the right, so labels above cross it least.
-ABOVE = ((-6, 5, "right", "bottom"), (0, 8, "center", "bottom"), (6, 5, "left", "bottom"))
-ASIDE = ((9, 0, "left", "center"), (-9, 0, "right", "center"))
-BELOW = ((0, -8, "center", "top"), (6, -5, "left", "top"), (-6, -5, "right", "top"))
-FARTHER = (1, 2.5, 4, 6, 8, 11, 14, 18, 23, 29)  # times these offsets, where that is taken, with a line to the point
 
 
 @dataclass(frozen=True)
@@ -68,10 +57,9 @@ def draw_chart(results: Sequence[MethodResult], metric: Metric, cost: Cost, *, l
     if not shown:
         return None
     names, front = families(results), pareto_front(results, metric, cost)
-    legend_height = LEGEND_ROW * -(-len(names) // LEGEND_COLUMNS) if legend else 0
-    height = HEIGHT + legend_height
-    figure = Figure(figsize=(WIDTH, height), facecolor="none")
-    axes = figure.add_axes((0.075, (0.6 + legend_height) / height, 0.91, (HEIGHT - 0.95) / height), facecolor="none")
+    height = 5.4 + (LEGEND_ROW * -(-len(names) // 4) if legend else 0)
+    figure = Figure(figsize=(WIDTH, height), facecolor="none", layout="constrained")
+    axes = figure.add_subplot(facecolor="none")
     places = _set_cost_axis(axes, {i: getattr(r, cost) for i, r in shown.items()}, cost)
     _set_measure_axis(axes, metric)
     low, high = _leave_out_input(axes, shown.values(), metric)
@@ -81,7 +69,7 @@ def draw_chart(results: Sequence[MethodResult], metric: Metric, cost: Cost, *, l
         _draw_point(axes, point, metric, cost)
     _draw_front(axes, points)
     if legend:
-        _draw_legend(figure, names)
+        _draw_legend(figure, names, columns=4)
     _draw_labels(figure, axes, points, metric)
     return figure
 
@@ -101,7 +89,7 @@ def _set_cost_axis(axes: Axes, costs: dict[int, float | None], cost: Cost) -> di
     ticks = [float(t) for t in LogLocator(subs=(1, 2, 5) if span < 3 else (1,)).tick_values(low, high)]
     ticks = [t for t in ticks if low <= t <= high]
     texts = [format_bytes(round(t * unit)) if cost == "peak_bytes" else format_seconds(t) for t in ticks]
-    gutter = (high / low) ** GUTTER
+    gutter = (high / low) ** 0.09  # columns of methods that cost nothing, and of those whose cost is unknown
     free, unknown, left, right = low / math.sqrt(gutter), high * math.sqrt(gutter), low, high
     if 0 in costs.values():
         left = low / gutter
@@ -153,7 +141,7 @@ def _leave_out_input(axes: Axes, shown: Collection[MethodResult], metric: Metric
 def _draw_point(axes: Axes, point: _Point, metric: Metric, cost: Cost) -> None:
     """Marker and error bars of a method: filled on the front."""
     result, statistic = point.result, point.result.metrics[metric.key]
-    color, kind, size = _style(point.family)
+    color, kind = _style(point.family)
     bars = [((point.x, point.x), (statistic.low, statistic.high))]
     if cost == "seconds_per_megapixel" and result.spread and result.spread[0] > 0:
         bars.append((result.spread, (point.y, point.y)))
@@ -165,7 +153,7 @@ def _draw_point(axes: Axes, point: _Point, metric: Metric, cost: Cost) -> None:
         [point.y],
         linestyle="none",
         marker=kind,
-        markersize=(8 + point.on_front) * size,
+        markersize=8 + point.on_front,
         markerfacecolor=color if point.on_front else "white",
         markeredgecolor="white" if point.on_front else color,
         markeredgewidth=0.8 if point.on_front else 1.4,
@@ -183,38 +171,35 @@ def _draw_front(axes: Axes, points: Sequence[_Point]) -> None:
 
 
 def _draw_labels(figure: Figure, axes: Axes, points: Sequence[_Point], metric: Metric) -> None:
-    """Names of all points, the front's first, farther off where it is crowded."""
+    """Names of all points, the front's first, where it is crowded farther off with a line to the point."""
     figure.draw_without_rendering()
-    pixels = [axes.transData.transform((p.x, p.y)) for p in points]
-    taken = [Bbox.from_bounds(x - 6, y - 6, 12, 12) for x, y in pixels]
+    figure.set_layout_engine("none")  # labels do not move the axes
+    taken = [Bbox.from_bounds(x - 6, y - 6, 12, 12) for x, y in (axes.transData.transform((p.x, p.y)) for p in points)]
     frame = Bbox.from_extents(0, axes.bbox.y0, figure.bbox.width, figure.bbox.height)
     for p in sorted(points, key=lambda p: (not p.on_front, p.x)):
         name = " ".join(p.result.name.split())
         if p.y != (mean := p.result.metrics[metric.key].mean):
             name += f" {format_value(mean, metric)}, off the scale"
-        words = name if len(name) <= LONGEST_LABEL else name[: LONGEST_LABEL - 1] + "…"
+        words = name if len(name) <= 34 else name[:33] + "…"
         weight, color = ("bold", "#222") if p.on_front else ("normal", "#555")
         text = axes.annotate(words, (p.x, p.y), (0, 0), textcoords="offset points", annotation_clip=False, fontsize=9)
         text.set(weight=weight, color=color, parse_math=False, gid=f"name-{p.index}")
-        near = (*ABOVE, *ASIDE, *BELOW) if p.on_front else (*ASIDE, *BELOW, *ABOVE)
-        for farther, (dx, dy, horizontal, vertical) in product(FARTHER, near):
-            offset = farther * dx, farther * dy
-            text.set(position=offset, horizontalalignment=horizontal, verticalalignment=vertical)
+        # The front's line leads to a point from below and from it to the right, so labels above cross it least.
+        sides = [(dx, dy) for dy in ((1, 0, -1) if p.on_front else (0, -1, 1)) for dx in (-1, 0, 1) if dx or dy]
+        for points_off, (dx, dy) in product(range(7, 240, 9), sides):
+            text.set(position=(points_off * dx, points_off * dy))
+            text.set(horizontalalignment={-1: "right", 0: "center", 1: "left"}[dx])
+            text.set(verticalalignment={-1: "top", 0: "center", 1: "bottom"}[dy])
             box = text.get_window_extent()
             if np.array_equal(Bbox.union([box, frame]).extents, frame.extents) and not box.count_overlaps(taken):
                 break
         taken.append(box)
-        if farther > FARTHER[0]:
+        if points_off > 7:
             start = axes.transData.transform((p.x, p.y))
-            end = axes.transData.inverted().transform(start + np.multiply(offset, figure.dpi / 72))
-            style: dict[str, Any] = {
-                "color": color,
-                "linewidth": 0.5,
-                "zorder": 1,
-                "clip_on": False,
-                "gid": f"bar-{p.index}",
-            }
-            axes.plot(*zip((p.x, p.y), end, strict=True), scalex=False, scaley=False, **style)
+            end = axes.transData.inverted().transform(start + np.multiply(text.get_position(), figure.dpi / 72))
+            line = Line2D([p.x, end[0]], [p.y, end[1]], color=color, linewidth=0.5, zorder=1, clip_on=False)
+            line.set_gid(f"bar-{p.index}")
+            axes.add_artist(line)
 
 
 def draw_curves(
@@ -229,8 +214,8 @@ def draw_curves(
     length = max(map(len, series.values()), default=0)
     if length < 3:
         return None
-    figure = Figure(figsize=(WIDTH, 2.6), facecolor="none")
-    axes = figure.add_axes((0.075, 0.16, 0.745, 0.72), facecolor="none")
+    figure = Figure(figsize=(WIDTH, 2.6), facecolor="none", layout="constrained")
+    axes = figure.add_subplot(facecolor="none")
     _set_measure_axis(axes, metric)
     named = len(frames) - length in (0, 1)
     numbers = frames[-length:] if named else range(1, length + 1)
@@ -252,18 +237,16 @@ def draw_ladder(ladder: Ladder) -> Figure | None:
     if not metrics:
         return None
     names = list(dict.fromkeys(name for m in metrics for name in ladder[m.key]))
-    legend_height = LEGEND_ROW * -(-len(names) // LADDER_COLUMNS) + 0.05
-    height = LADDER_HEIGHT + legend_height
-    figure = Figure(figsize=(WIDTH, height), facecolor="none")
-    width = 1 / len(metrics)
-    for index, metric in enumerate(metrics):
-        place = (index + 0.14) * width, (0.5 + legend_height) / height, 0.82 * width, (LADDER_HEIGHT - 0.9) / height
-        axes = figure.add_axes(place, facecolor="none")
+    height = 4.0 + LEGEND_ROW * -(-len(names) // 5)
+    figure = Figure(figsize=(WIDTH, height), facecolor="none", layout="constrained")
+    panels = figure.subplots(1, len(metrics), squeeze=False)[0]
+    for metric, axes in zip(metrics, panels, strict=True):
+        axes.set_facecolor("none")
         counts = sorted({n for curve in ladder[metric.key].values() for n, _ in curve})
         for name, curve in ladder[metric.key].items():
-            color, kind, size = _style(names.index(name))
+            color, kind = _style(names.index(name))
             style = "--" if name == INPUT else "-"
-            axes.plot(*zip(*curve, strict=True), color=color, marker=kind, markersize=6.4 * size, linestyle=style)
+            axes.plot(*zip(*curve, strict=True), color=color, marker=kind, markersize=6.4, linestyle=style)
         axes.set(xscale="log", yscale="log")
         if metric.key not in ERRORS:  # the range of FLIP seldom has a power of ten
             _set_plain_ticks(axes)
@@ -275,23 +258,23 @@ def draw_ladder(ladder: Ladder) -> Figure | None:
         axes.grid(color="#88888833", linewidth=0.8)
         axes.tick_params(which="both", length=0, labelcolor="#555")
         axes.spines[["top", "left", "right"]].set_visible(False)
-    _draw_legend(figure, names, LADDER_COLUMNS, lines=True)
+    _draw_legend(figure, names, columns=5, lines=True)
     return figure
 
 
-def _style(index: int) -> tuple[str, str, float]:
-    """Color, marker and its relative size, by the index of a family or of a method."""
-    return COLORS[index % len(COLORS)], MARKERS[index % len(MARKERS)], SIZES[index % len(SIZES)]
+def _style(index: int) -> tuple[str, str]:
+    """Color and marker, by the index of a family or of a method."""
+    return COLORS[index % len(COLORS)], MARKERS[index % len(MARKERS)]
 
 
-def _draw_legend(figure: Figure, names: Sequence[str], columns: int = LEGEND_COLUMNS, *, lines: bool = False) -> None:
+def _draw_legend(figure: Figure, names: Sequence[str], columns: int, *, lines: bool = False) -> None:
     handles = []
     for i, name in enumerate(names):
-        color, kind, size = _style(i)
-        handle = Line2D([], [], color=color, marker=kind, markersize=8 * size)
+        color, kind = _style(i)
+        handle = Line2D([], [], color=color, marker=kind, markersize=8)
         handle.set_linestyle("" if not lines else "--" if name == INPUT else "-")
         handles.append(handle)
-    legend = figure.legend(handles, ["-"] * len(names), loc=(0.05, 0), ncols=columns, frameon=False)
+    legend = figure.legend(handles, ["-"] * len(names), loc="outside lower left", ncols=columns, frameon=False)
     for text, name in zip(legend.get_texts(), names, strict=True):  # given as labels, names with a leading "_" are lost
         text.set(text=" ".join(name.split()), parse_math=False, fontsize=9)
 
@@ -317,9 +300,8 @@ def to_png(figure: Figure) -> bytes:
     return out.getvalue()
 
 
-def marker(family: int, size: float = 6.5) -> str:
+def marker(family: int) -> str:
     """Return the points of an SVG polygon with the marker of a family, by its index, around the origin."""
-    _, kind, relative = _style(family)
-    style, scale = MarkerStyle(kind), 2 * size * relative
-    path = style.get_path().transformed(style.get_transform() + Affine2D().scale(scale, -scale))
+    style = MarkerStyle(_style(family)[1])
+    path = style.get_path().transformed(style.get_transform() + Affine2D().scale(13, -13))
     return " ".join(f"{x:.2f},{y:.2f}" for x, y in np.asarray(path.to_polygons()[0]))
