@@ -514,7 +514,7 @@ class Job:
     def plan_memory(self) -> MemoryPlan:
         """How the run stays within its limit, if it has one; ValueError where not even a band of rows fits."""
         if self.options.max_memory is None:
-            return MemoryPlan(None, in_files=False, trims=False, background=True)
+            return MemoryPlan(None, in_files=False, background=True)
         return plan_memory(
             parse_size(self.options.max_memory) // len(self.views),
             self.views[0],

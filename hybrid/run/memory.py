@@ -17,37 +17,20 @@ from hybrid.files.layers import Layers
 from hybrid.files.shots import Shot
 
 STRIP = 64  # rows are taken in whole strips of the guided filter
-# Bytes of a process that has read nothing: Python, the libraries, the compiled code; and with torch.
-BASE, BASE_NEURAL = 220 * 2**20, 470 * 2**20
-# Bytes of OIDN: its code, most of which torch loads anyway; and for each pixel, up to its limit, in its slowest mode.
-OIDN, OIDN_NEURAL, OIDN_OF_PIXEL = 230 * 2**20, 80 * 2**20, 750
-CODE = 64 * 2**20  # the part of it that stays when OIDN has run
+MIB = 2**20
 # Share of the limit that is planned for; the allocator rounds up, and does not return all memory at once: at 960×540
 # the peak is 4 % above the plan.
 SHARE = 0.94
-# Temporary planes while rows of a window are filtered, while they are aligned for a network, while it reads them, and
-# while samples correct a finished picture.
-FILTERING, ALIGNING, GIVING, FINISHING = 40, 24, 20, 38
-# Planes that exist while pairs of frames are compared before a run: 4.9 GiB at 7680×4320, while the second is read.
-VALIDATING = 38
-# Temporary planes while OIDN's networks filter the guides of a frame, in float32: 50 at 1920×1080.
-CLEANING = 60
-# Temporary planes while TV-L1 solves for a flow.
-REFINING = 38
-# Planes of a frame while a network in torch makes its first pass, beside that network.
-PASSING = 14
-# Planes of free memory that a process keeps in pieces where it returns none, with kept frames in files: 200 to 300 MiB
-# at 1920×1080 with `fast`, `balanced` and `quality`.
-FREED = 40
-# Bands of rows leave free memory in more pieces: `fast` takes 1429 MiB at 1920×1080 in bands of 448 rows, in float32.
-PIECES = 1.1
-_UNITS = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
+# Temporary planes of the fullest steps: pairs of frames are compared before a run (4.9 GiB at 7680×4320), TV-L1 solves
+# for a flow, rows of a window are filtered, samples correct a finished picture. A network takes its own memory beside
+# `BESIDE_NETWORK` planes.
+WORKING, BESIDE_NETWORK = 40, 20
 
 
 def parse_size(text: str) -> int:
     """Bytes of a size such as ``8G``, ``8GiB`` or ``500M``, in powers of 1024; ValueError if it is none, or absurd."""
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT])(?:i?B)?\s*", text, re.IGNORECASE)
-    size = 0.0 if match is None else float(match[1]) * _UNITS[match[2].upper()]
+    size = 0.0 if match is None else float(match[1]) * 2.0 ** (10 + 10 * "KMGT".index(match[2].upper()))
     if not 1 <= size < 2.0**63:
         shown = text if len(text) < 60 else f"{text[:56]}…"
         raise ValueError(f"max-memory is {shown!r}, expected a size with its unit, such as 8G or 500M")
@@ -58,8 +41,7 @@ class MemoryPlan(NamedTuple):
     """How a run stays within its limit."""
 
     rows: int | None  # of a frame that are worked on at a time, a multiple of 64; None for all
-    in_files: bool  # whether the values that later windows read lie in temporary files
-    trims: bool  # whether freed memory is returned to the system before stages that take much of it
+    in_files: bool  # whether the values that later windows read lie in temporary files, and freed memory is returned
     background: bool  # whether the next frame is read, and the last one written, while a frame is worked on
 
 
@@ -77,7 +59,7 @@ def plan_memory(
     """Plan a run: whole frames in memory if they fit, else with kept values in files, and as many rows as then fit.
 
     With memory to spare a frame is read and one is written in the background: 0.93 of the time of `fast` at 1920×1080.
-    `fast` there takes 1.07 times the CPU time with files (two runs), and 1.18 times where freed memory is returned too.
+    `fast` there takes 1.18 times the CPU time with files and freed memory returned (two runs).
     The result is the same for the same arguments, on every machine. `stages` are those that may run on some frame,
     `network` maps height and width to the bytes that a network takes while it runs, `first_network` to those of one
     that makes a first pass; with `filters_guides` the guides of frames are filtered for a network. Raises ValueError,
@@ -87,56 +69,51 @@ def plan_memory(
     prepared, finished or worked on. `tests/reliability/test_memory.py` measures the true peak.
     """
     height, width = shot.shape
-    layers, neural = shot.layers(shot.numbers[0]), network(shot.shape) is not None
+    plane, network_bytes = 4 * height * width, network(shot.shape)
+    layers, neural = shot.layers(shot.numbers[0]), network_bytes is not None
     kept = kept_planes(shot, stages, first_pass, radius, filters_guides=filters_guides)
-    filters_guides &= "clean-guides" in stages
     # The frame as read, with the file that it is read from, or with what is prepared of it.
     prepared = prepared_planes(layers)
     channels = len(shot.header(shot.numbers[0]).channel_names)
     reading = prepared + max(channels, prepared)
     # The next frame as read, the last one with its result, and the channels of a file for either.
     beside = 2 * prepared + 2 * channels
-    passing = max(reading, REFINING if can_refine(stages) else 0)
     # A first pass made of windows is filtered beside a network too.
     filtered = not neural or (first_pass is not None and first_pass.from_noisy)
     worked, aligned = _worked_planes(layers, 2 * radius + 1, filtered)
     if "reflections" in stages and first_pass is not None:
         # The flows of light, and first passes along surfaces beside those along light.
         aligned += 7.0 * (2 * radius + 1)
-    plane = 4 * height * width
-    base, code = (BASE_NEURAL, OIDN_NEURAL) if neural else (BASE, OIDN)
+    # Python, the libraries and the compiled code; with torch more, and then less for OIDN, whose code torch has loaded.
+    base, code = (470 * MIB, 80 * MIB) if neural else (220 * MIB, 230 * MIB)
     holds = 0 if first_pass is None else first_pass.holds
-    oidn = min(holds, code + OIDN_OF_PIXEL * height * width * holds // HOLDS)
+    oidn = min(holds, code + 750 * height * width * holds // HOLDS)  # bytes of each pixel in its slowest mode
+    # OIDN filters the guides of a frame in 60 planes of float32.
+    guides = 60 if filters_guides and "clean-guides" in stages else 0
 
-    def needed(rows: int, in_files: bool, trims: bool = True, background: bool = False) -> int:
-        outer = min(rows + 2 * MARGIN, height)
-        share = outer / height
+    def needed(rows: int, in_files: bool, background: bool = False) -> int:
+        share = min(rows + 2 * MARGIN, height) / height
         # From files the centre and one neighbour are read at a time (`hybrid.runtime.kept.Keeper.release`), and by a
         # network few rows of the neighbour.
         held, read = (0.0, prepared + 3) if in_files else (kept, 0.0)
         # The features of a strip are as large in a band.
-        working = plane * share * (worked + read * (1 if neural else 2)) + (network(shot.shape) or 0)
+        working = plane * share * (worked + read * (1 if neural else 2)) + (network_bytes or 0)
         working = max(working, plane * share * (aligned + 2 * read))
-        working += min(oidn, CODE)  # a first pass is made while frames are prepared
-        cleaning = CLEANING if filters_guides else 0
+        working += min(oidn, 64 * MIB)  # stays when OIDN has made the first pass of a frame
+        # Bands leave free memory in more pieces: `fast` takes 1429 MiB at 1920×1080 in bands of 448 rows, in float32.
+        working *= 1.1 if rows < height else 1
         # With frames in memory the final stage takes more than a first pass.
-        first_passes = plane * PASSING + first_network(shot.shape) if in_files else 0
-        working *= PIECES if rows < height else 1
-        at_once = max(plane * passing + oidn, first_passes, plane * cleaning, plane * FINISHING, working)
+        first_passes = plane * BESIDE_NETWORK + first_network(shot.shape) if in_files else 0
+        steps = max(reading, WORKING if can_refine(stages) else 0)
+        at_once = max(plane * steps + oidn, first_passes, plane * max(guides, WORKING), working)
         held += beside if background else 0.0
-        held += FREED if in_files and not trims else 0.0
-        return base + round(max(plane * held + at_once, plane * VALIDATING))
+        return base + round(plane * held + at_once)
 
     budget = round(SHARE * limit)
     # With kept frames in files `fast` takes no less time if others are read and written in the background.
-    for in_files, trims, background in (
-        (False, False, True),
-        (False, False, False),
-        (True, False, False),
-        (True, True, False),
-    ):
-        if needed(height, in_files, trims, background) <= budget:
-            return MemoryPlan(None, in_files, trims, background)
+    for in_files, background in ((False, True), (False, False), (True, False)):
+        if needed(height, in_files, background) <= budget:
+            return MemoryPlan(None, in_files, background)
     if needed(STRIP, True) > budget:
         least = math.ceil(100 * needed(STRIP, True) / SHARE / 2**30) / 100  # so much is enough
         raise ValueError(
@@ -145,14 +122,14 @@ def plan_memory(
     rows = STRIP
     while needed(rows + STRIP, True) <= budget:
         rows += STRIP
-    return MemoryPlan(rows, in_files=True, trims=True, background=False)
+    return MemoryPlan(rows, in_files=True, background=False)
 
 
 def _worked_planes(layers: Layers, frames: int, filtered: bool) -> tuple[float, float]:
     """Count the float32 planes of an aligned window of so many frames, with what reads it, and while it is aligned."""
     if filtered:
-        return 2.0 * frames * aligned_planes(layers) + FILTERING, 0.0
+        return 2.0 * frames * aligned_planes(layers) + WORKING, 0.0
     # A network reads the first pass, confidences and AOVs alone.
     aovs = sum(len(layer.channels) for layer in layers.aovs.values()) + (layers.alpha is not None)
     # While it is aligned, also the confidence by geometry and the weights of drift.
-    return frames * (4 + 2.0 * aovs) + GIVING, frames * (6 + 2.0 * aovs) + ALIGNING
+    return frames * (4 + 2.0 * aovs) + BESIDE_NETWORK, frames * (6 + 2.0 * aovs) + BESIDE_NETWORK

@@ -67,8 +67,7 @@ class RunSettings:
     """How frames are read, denoised and written; none of it changes a pixel."""
 
     rows: int | None = None  # how many rows of a frame to work on at a time (`memory.plan_memory`); None for all
-    in_files: bool = False  # whether the values that later windows read lie in temporary files
-    trims: bool = False  # whether freed memory is returned to the system before stages that take much of it
+    in_files: bool = False  # whether values that later windows read lie in files, and freed memory is returned
     # whether to read and write in the background, which takes the memory of one frame read and one written
     background: bool = True
     # leave frames alone that are there, whole, and would be the same: with these attributes, of the same files
@@ -176,7 +175,7 @@ class _ShotDenoiser:
         self.ahead = self.support - REACH - ("whiten" in rules.allowed)
         self.lost: dict[int, Exception] = {}  # frames that could not be read, which count as missing
         self.sources = sources_of(views, radius, rules, settings.sources, self.lost)
-        keeper = Keeper(in_files=settings.in_files, trims=settings.trims)
+        keeper = Keeper(in_files=settings.in_files)
 
         def follow(view: View) -> tuple[Prefetcher, FrameDenoiser]:
             reader = Prefetcher(view.shot, thread, timings, self.lost)

@@ -26,11 +26,10 @@ class Keeper:
     """With `in_files`, moves arrays to temporary files without a name, each mapped as long as the array is referred to.
 
     The system removes the files however the process ends. Pages that have been read stay in memory until `release`.
-    With `trims` freed memory is returned to the system at each `trim`.
     """
 
-    def __init__(self, *, in_files: bool = False, trims: bool = False) -> None:
-        self.in_files, self._trims = in_files, trims
+    def __init__(self, *, in_files: bool = False) -> None:
+        self.in_files = in_files
         self._mappings: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
 
     def keep(self, value: Value) -> Value:
@@ -62,14 +61,14 @@ class Keeper:
                 mapping.madvise(mmap.MADV_DONTNEED)
 
     def trim(self) -> None:
-        """Release pages and, with `trims`, return freed memory: before each stage that takes much of it.
+        """Release pages, and return freed memory to the system: before each stage that takes much of it.
 
         At the end of a stage half of the process's memory is free, in pieces that blocks of the next may not fit in.
         `fast` at 1920×1080 takes 1.1 times the CPU time with it, and 1.5 times where glibc returns all blocks of more
         than 4 MiB as they are freed.
         """
-        self.release()
-        if self._trims:
+        if self.in_files:
+            self.release()
             return_freed_memory()
 
     def _keep(self, value: Any, moved: dict[int, Any]) -> Any:

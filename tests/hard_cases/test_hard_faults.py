@@ -384,7 +384,7 @@ def test_the_network_in_parts_is_the_network(tall, rows):
 
 def test_memory_is_planned_or_refused(tall, tmp_path, capsys, monkeypatch):
     shot = open_shot(tall)
-    assert plan_memory(2**40, shot, STAGES, None) == (None, False, False, True)
+    assert plan_memory(2**40, shot, STAGES, None) == (None, False, True)
     assert draft(tall, tmp_path / "out", "--max-memory", "10M") == 1
     assert "expected at least" in capsys.readouterr().err
     monkeypatch.setattr(type(shot), "shape", (2160, 3840))
@@ -396,8 +396,6 @@ def test_memory_is_planned_or_refused(tall, tmp_path, capsys, monkeypatch):
             rows.append(plan.rows or 2160)
             background.append(plan.background)
             assert plan.in_files or plan.rows is None  # bands of rows cost more than files
-            assert plan.trims or plan.rows is None  # and more than zeroed pages
-            assert plan.in_files or not plan.trims
     assert rows == sorted(rows)  # more memory, more rows
     assert background == sorted(background)  # and with enough for two more frames these are read and written meanwhile
     assert {*background} == {False, True}
@@ -464,7 +462,7 @@ def test_whole_frames_lie_in_files_before_bands_of_rows_are_worked_on(
         )  # fmt: skip
 
     assert plan(1.15 * peak)[:2] == (None, True)
-    assert plan(1.06 * peak) == (None, True, True, False)
+    assert plan(1.06 * peak) == (None, True, False)
     with suppress(ValueError):  # less than the fewest rows take
         assert plan(0.97 * peak).rows is not None
 
@@ -505,7 +503,7 @@ def test_too_little_memory_is_refused_before_any_pixel_is_read(tmp_path, monkeyp
 
 def test_little_memory_gives_the_same_bytes(tall, tmp_path, monkeypatch):
     assert draft(tall, tmp_path / "whole") == 0
-    monkeypatch.setattr("hybrid.run.job.plan_memory", lambda *_, **__: MemoryPlan(64, True, True, False))
+    monkeypatch.setattr("hybrid.run.job.plan_memory", lambda *_, **__: MemoryPlan(64, True, False))
     monkeypatch.setattr("hybrid.runtime.kept.SMALLEST", 1)
     assert draft(tall, tmp_path / "parts", "--max-memory", "1G") == 0
     assert contents(tmp_path / "whole") == contents(tmp_path / "parts")

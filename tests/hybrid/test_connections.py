@@ -98,14 +98,14 @@ def test_memory_is_shared_between_the_views_of_a_file(tmp_path, monkeypatch):
     assert asked[-1] == 4 * 2**30
 
 
-@pytest.mark.parametrize("plan", [MemoryPlan(64, True, True, False), MemoryPlan(None, False, False, True)])
+@pytest.mark.parametrize("plan", [MemoryPlan(64, True, False), MemoryPlan(None, False, True)])
 def test_a_run_keeps_to_its_plan_of_memory(shot_folder, tmp_path, monkeypatch, plan):
     asked = []
     monkeypatch.setattr(job, "plan_memory", lambda *_, **__: plan)
     monkeypatch.setattr(job, "denoise_frames", lambda *words, **_: iter(asked.append(words[4]) or ()))
     options = job.DenoiseOptions(preset="draft", max_memory="8G")
     assert list(job.Job.open(open_shot(shot_folder), tmp_path / "out", options).run()) == []
-    assert [(made.rows, made.in_files, made.trims, made.background) for made in asked] == [plan]
+    assert [(made.rows, made.in_files, made.background) for made in asked] == [plan]
 
 
 def test_the_number_of_threads_is_that_which_was_asked_for(shot_folder, tmp_path, monkeypatch):

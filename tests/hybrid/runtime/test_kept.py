@@ -66,14 +66,14 @@ def test_what_has_no_arrays_is_left_alone():
     assert Keeper().keep(given := np.ones((8, 8))) is given  # without files nothing is copied
 
 
-@pytest.mark.parametrize("trims", [False, True])
-def test_freed_memory_is_returned_where_that_is_asked_for(monkeypatch, trims):
+@pytest.mark.parametrize("in_files", [False, True])
+def test_freed_memory_is_returned_where_that_is_asked_for(monkeypatch, in_files):
     calls = []
     monkeypatch.setattr("hybrid.runtime.kept.return_freed_memory", lambda: calls.append("freed"))
-    keeper = Keeper(in_files=True, trims=trims)
+    keeper = Keeper(in_files=in_files)
     monkeypatch.setattr(keeper, "release", lambda: calls.append("pages"))
     keeper.trim()
-    assert calls == (["pages", "freed"] if trims else ["pages"])
+    assert calls == (["pages", "freed"] if in_files else [])
 
 
 def test_a_mapping_ends_with_its_array():
