@@ -15,8 +15,6 @@ from hybrid.commands.chunks import Chunk, ChunkLog, log_stop, run_command
 from hybrid.commands.log import LOG
 from hybrid.runtime.interrupt import INTERRUPTED, interruptible
 
-PATIENCE = 10  # seconds that a connection may take
-
 
 def run_on_cluster(address: str, title: str, chunks: Mapping[str, Chunk], unit: str = "frames") -> None:
     """Run chunks, by name, on the workers of a scheduler, and log their progress.
@@ -29,7 +27,7 @@ def run_on_cluster(address: str, title: str, chunks: Mapping[str, Chunk], unit: 
     except ModuleNotFoundError as error:
         raise ImportError('distributed is not installed; expected: pip install "distributed"') from error
     try:
-        client = Client(address, timeout=PATIENCE, set_as_default=False)
+        client = Client(address, timeout=10, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         raise OSError(f"no Dask scheduler answers at {address}, expected one as `dask scheduler` starts it") from error
     topic = f"ravg-{uuid4().hex}"

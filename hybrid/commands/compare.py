@@ -97,7 +97,7 @@ class _Report:
                 Console().print("", ladder_table(rows))
 
 
-@opt.command("compare", opt.ReadOptions, _Report)
+@opt.command("compare", ShotInput, _Report)
 def compare(
     shot: str | None = None,
     reference: list[str] | None = None,
@@ -125,7 +125,8 @@ def compare(
     if ladder and not level:
         raise typer.BadParameter("--ladder runs the methods on levels, expected --level with it")
     report.check()
-    read, strict = ShotInput(shot=shot, **how), how["strict"]
+    read = ShotInput(shot=shot, **how)
+    strict = read.strict
     alike, findings = validate_renders({"shot": read.open()}, strict=strict)
     noisy = alike["shot"]
     clean = [_open_matching(spec, noisy, read.frames) for spec in reference]

@@ -75,7 +75,7 @@ class Request:
         return [(view, shots.in_view(self, view)) for view in views]
 
 
-@opt.command("denoise", opt.ReadOptions, DenoiseOptions)
+@opt.command("denoise", shots.ShotInput, DenoiseOptions)
 def denoise(
     context: typer.Context,
     shot: str,
@@ -87,14 +87,13 @@ def denoise(
     stages: list[str] | None = None,
     no_stages: list[str] | None = None,
     device: opt.Device = "auto",
-    max_pixels: int | None = None,
     scheduler: str | None = None,
     chunk: int = 10,
     jobs: int = 1,
     **settings: Any,
 ) -> None:
     """Denoise each view of a shot, in this process, in several, or on a cluster."""
-    reading = opt.take(opt.ReadOptions, settings)
+    reading = opt.take(shots.ShotInput, settings)
     with opt.usage():
         options = DenoiseOptions(
             **settings,
@@ -107,7 +106,7 @@ def denoise(
             raise ValueError("--budget and --breakdown are of one process, expected no --scheduler or --jobs with them")
         if scheduler is not None and jobs > 1:
             raise ValueError("--jobs are processes on this machine, expected no --scheduler with them")
-    source = shots.ShotInput(shot=shot, aovs=tuple(aov or ()), max_pixels=max_pixels, **reading)
+    source = shots.ShotInput(shot=shot, aovs=tuple(aov or ()), **reading)
     requests = Request(source, output, options, preview, contact_sheet, fps).of_views()
     if options.method == "network":
         shots.import_neural()

@@ -27,17 +27,16 @@ from hybrid.files.layers import describe_layers
 from hybrid.run.job import validate_views
 
 
-@opt.command("inspect", opt.ReadOptions)
+@opt.command("inspect", ShotInput)
 def inspect(
     shot: str,
     stages: list[str] | None = None,
     no_stages: list[str] | None = None,
     as_json: bool = False,
-    max_pixels: int | None = None,
     **how: Any,
 ) -> None:
     """Print layers, findings and plan of each view of a shot."""
-    read = ShotInput(shot=shot, max_pixels=max_pixels, **how)
+    read = ShotInput(shot=shot, **how)
     with opt.usage():
         rules = Rules(frozenset(split_stages(stages)), frozenset(split_stages(no_stages)))
     views = views_of(shot)

@@ -26,7 +26,6 @@ LOG = logging.getLogger("ravg")
 LOG.propagate = False
 
 LogFormat = Literal["text", "json", "openjd"]
-LABEL_WIDTH = 12
 # ASCII replacements of the signs that are used here.
 _PLAIN = {"≤": "<=", "×": "x", "–": "-", "−": "-", "—": "-", "…": "...", "·": ".", "≈": "~", "∞": "inf", "→": "->"}
 
@@ -235,7 +234,7 @@ class _Terminal(logging.Handler):
 def _message(record: logging.LogRecord) -> str:
     before = f"{record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
     if (label := getattr(record, "label", None)) is not None:
-        before = f"{label:<{LABEL_WIDTH}}"
+        before = f"{label:<12}"
     return before + record.getMessage()
 
 

@@ -5,7 +5,7 @@ import math
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
@@ -22,20 +22,6 @@ Device = Literal["auto", "cpu", "cuda", "hip", "sycl", "metal"]
 _OTHER_KINDS = re.compile(r"\.(avi|bmp|dpx|gif|hdr|jpe?g|mkv|mov|mp4|pfm|png|tga|tiff?|webp)", re.IGNORECASE)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReadOptions:
-    """The options that say how a shot is read."""
-
-    frames: str | None = None
-    layer: list[str] | None = None
-    profile: str | None = None
-    motion: str | None = None
-    strict: bool = False
-
-
-AS_IT_IS = ReadOptions()
-
-
 @dataclass(frozen=True)
 class LogOptions:
     """Options of the log that every command has."""
@@ -49,8 +35,8 @@ class LogOptions:
 def command(name: str, *configs: type) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Make a function a command: with options for its parameters and for fields of dataclasses, and with a log.
 
-    `hybrid.run.option_texts` describes the options; a field without an entry is none. The function gets the values of
-    fields by keyword. A function in the `Annotated` of a parameter checks its value.
+    `hybrid.run.option_texts` describes the options; a field without an entry or a default is none. The function gets
+    the values of fields by keyword. A function in the `Annotated` of a parameter checks its value.
     """
     texts = option_texts(name)
 
@@ -70,7 +56,7 @@ def command(name: str, *configs: type) -> Callable[[Callable[..., None]], Callab
         for config in (*configs, LogOptions):
             hints = get_type_hints(config, include_extras=True)
             for item in fields(config):
-                if item.name in texts and item.name not in parameters:
+                if item.name in texts and item.name not in parameters and item.default is not MISSING:
                     field = inspect.Parameter(item.name, keyword, default=item.default, annotation=hints[item.name])
                     parameters[item.name] = field
         context = inspect.Parameter("context", keyword, annotation=typer.Context)

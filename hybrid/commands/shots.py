@@ -11,7 +11,7 @@ import typer
 
 from hybrid.checks.validation import Finding, ValidationReport, find_cut, find_repeat, validate_layers
 from hybrid.commands.log import LOG, printable
-from hybrid.commands.options import ReadOptions, usage
+from hybrid.commands.options import usage
 from hybrid.denoising.plan import Plan
 from hybrid.files.exr import MAX_PIXELS
 from hybrid.files.profile import ROLES, Profile, open_profile, parse_motion
@@ -38,11 +38,16 @@ def import_neural() -> ModuleType:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShotInput(ReadOptions):
+class ShotInput:
     """The options that say which shot is read, and how; bad usage raises BadParameter before a file is opened."""
 
     shot: str
     aovs: Sequence[str] = ()
+    frames: str | None = None
+    layer: list[str] | None = None
+    profile: str | None = None
+    motion: str | None = None
+    strict: bool = False
     max_pixels: int | None = None
 
     def __post_init__(self) -> None:
@@ -52,8 +57,8 @@ class ShotInput(ReadOptions):
                 parse_frames(self.frames)
         parse_input(self.profile, self.motion)
 
-    def open(self) -> Shot:
-        """Open the shot; warnings are logged."""
+    def open(self, *, keep: int = 0) -> Shot:
+        """Open the shot, which holds `keep` frames in memory; warnings are logged."""
         watch_compiling()
         opened = open_shot(
             self.shot,
@@ -62,6 +67,7 @@ class ShotInput(ReadOptions):
             profile=parse_input(self.profile, self.motion),
             motion=self.motion,
             aovs=tuple(self.aovs),
+            keep=keep,
             max_pixels=MAX_PIXELS if self.max_pixels is None else self.max_pixels,
         )
         for warning in opened.warnings:

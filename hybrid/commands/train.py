@@ -1,6 +1,7 @@
 """The commands that make training clips and train a network on them."""
 
 import glob
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -11,7 +12,7 @@ from hybrid.commands import options as opt
 from hybrid.commands.chunks import Chunk, arguments_of
 from hybrid.commands.cluster import run_on_cluster
 from hybrid.commands.log import LOG, Progress
-from hybrid.commands.shots import import_neural, log_cuts, parse_input, parse_layers, validate_renders
+from hybrid.commands.shots import ShotInput, import_neural, log_cuts, validate_renders
 from hybrid.denoising.plan import Context
 from hybrid.denoising.stream import plan_shot
 from hybrid.files.replace import check_outputs
@@ -30,14 +31,14 @@ class Levels(NamedTuple):
         return next(iter(self.shots.values()))
 
 
-def open_levels(spec: str, samples: dict[str, float] | None = None, read: opt.ReadOptions = opt.AS_IT_IS) -> Levels:
+def open_levels(spec: str, samples: dict[str, float] | None = None, read: ShotInput | None = None) -> Levels:
     """Find the noise levels of a shot: all independent renders in a folder, ``LEVEL.####.exr``, or one sequence.
 
     `samples` are the levels to open and their samples per pixel, by default all but those named ``reference…``, as the
     headers of Cycles have them. Raises FileNotFoundError if there is no such folder, sequence or level, and ValueError
     if there are several levels and no samples of one of them.
     """
-    path, roles, profile = Path(spec), parse_layers(read.layer), parse_input(read.profile, read.motion)
+    path = Path(spec)
     if path.is_dir():
         found = sorted({item.name.partition(".")[0] for item in path.glob("*.exr") if not item.name.startswith(".")})
         names = [name for name in found if not name.startswith("reference")] if samples is None else list(samples)
@@ -48,10 +49,7 @@ def open_levels(spec: str, samples: dict[str, float] | None = None, read: opt.Re
     else:
         path = path.parent
         specs = {Path(spec).name.partition(".")[0]: spec}
-    levels = {
-        name: open_shot(item, frames=read.frames, layers=roles, profile=profile, motion=read.motion, keep=1)
-        for name, item in specs.items()
-    }
+    levels = {name: replace(read or ShotInput(shot=spec), shot=item).open(keep=1) for name, item in specs.items()}
     counts = []
     for name, shot in levels.items():
         count = (samples or {}).get(name) or shot.samples
@@ -61,7 +59,7 @@ def open_levels(spec: str, samples: dict[str, float] | None = None, read: opt.Re
     return Levels(path.resolve().name, levels, counts)
 
 
-@opt.command("make-clips", opt.ReadOptions)
+@opt.command("make-clips", ShotInput)
 def make_clips(
     context: typer.Context,
     shots: list[str],
@@ -88,7 +86,7 @@ def make_clips(
     neural = import_neural()
     with opt.usage():
         samples = None if levels is None else parse_samples(levels)
-    read = opt.ReadOptions(**how)
+    read = ShotInput(shot=shots[0], **how)
     opened = [open_levels(spec, samples, read) for spec in shots]
     _check_levels(opened, target)
     if scheduler is not None:
@@ -117,7 +115,7 @@ def make_clips(
             each.name,
             inputs,
             [count for level, count in zip(each.shots, each.samples, strict=True) if level != target],
-            reference=open_shot(clean, keep=1) if reference else None,
+            reference=open_shot(clean, keep=1, max_pixels=each.first.max_pixels) if reference else None,
             target=render,
         )
         neural.write_clips(

@@ -79,6 +79,11 @@ class Shot:
         return self.reader.interpretation.passes
 
     @property
+    def max_pixels(self) -> int:
+        """The limit of `hybrid.files.exr.read_exr`."""
+        return self.reader.files.max_pixels
+
+    @property
     def shape(self) -> tuple[int, int]:
         """Height and width of every frame, from the headers."""
         return self.reader.headers.canvas.shape
@@ -370,14 +375,14 @@ def open_matching_sequence(spec: str | Path, shot: Shot, *, frames: str | None =
     The shot's color is chosen if the other's layers leave a choice, as between two view layers. Errors are those of
     `open_shot`.
     """
-    opened = open_shot(spec, frames=frames)
+    opened = open_shot(spec, frames=frames, max_pixels=shot.max_pixels)
     with suppress(ExrError):
         opened.layers(opened.numbers[0])
         return opened
     target = shot.layers(shot.numbers[0]).target
     with suppress(ExrError):
         opened.header(opened.numbers[0]).again(target)
-        return open_shot(spec, frames=frames, layers={"color": target})
+        return open_shot(spec, frames=frames, layers={"color": target}, max_pixels=shot.max_pixels)
     return opened
 
 

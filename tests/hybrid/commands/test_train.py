@@ -18,7 +18,7 @@ from tests.scenes import Scene
 torch = pytest.importorskip("torch")
 
 from hybrid.cli import main  # noqa: E402
-from hybrid.commands.options import ReadOptions  # noqa: E402
+from hybrid.commands.shots import ShotInput  # noqa: E402
 from hybrid.commands.train import open_levels, parse_samples  # noqa: E402
 from hybrid.files.exr import read_exr  # noqa: E402
 from hybrid.files.profile import open_profile  # noqa: E402
@@ -173,7 +173,9 @@ def test_levels_of_a_shot_are_found_without_its_references(shot):
 
 def test_levels_are_read_as_the_options_say(shot):
     albedo = "ViewLayer.Denoising Albedo"
-    read = ReadOptions(frames=str(SCENE.first), layer=[f"albedo={albedo}"], profile="arnold", motion="none")
+    read = ShotInput(
+        shot=str(shot), frames=str(SCENE.first), layer=[f"albedo={albedo}"], profile="arnold", motion="none"
+    )
     level = open_levels(str(shot), {"a": 24}, read).first
     assert level.numbers == (SCENE.first,)
     assert level.profile.name == open_profile("arnold").name
