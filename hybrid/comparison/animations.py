@@ -14,8 +14,7 @@ from hybrid.files.frame import Array
 from hybrid.files.movies import write_movie
 from hybrid.files.png import Image8, encode_bytes
 
-# Pixels of the longer side of an embedded frame, at most and at least, and of a WebP.
-LARGEST, SMALLEST, TALLEST = 480, 96, 16383
+TALLEST = 16383  # pixels of the longer side of a WebP
 QUALITY = 75
 LIMIT = 4e6  # bytes of all embedded animations
 
@@ -32,7 +31,7 @@ def embed_animations(images: ShotImages) -> Embedded:
     """
     encode = _encoder(images)
     height, width = images.reference(images.frames[0]).shape[:2]
-    side = float(min(LARGEST, max(height, width)))
+    side = float(min(480, max(height, width)))  # pixels of the longer side of a frame
     while True:
         scale = side / max(height, width)
         size = max(1, round(width * scale)), max(1, round(height * scale))
@@ -40,9 +39,9 @@ def embed_animations(images: ShotImages) -> Embedded:
         rows = -(-len(images.frames) // columns)
         sheets = [_sheet(map(encode, map(s.frame, images.frames)), rows, columns, size) for s in images.sources]
         total = sum(len(text) for text in sheets)
-        if total <= LIMIT or side <= SMALLEST:
+        if total <= LIMIT or side <= 96:
             break
-        side = max(SMALLEST, side * min(0.9, (LIMIT / total) ** 0.5))
+        side = max(96, side * min(0.9, (LIMIT / total) ** 0.5))
     info: dict[str, object] = {
         "width": size[0],
         "height": size[1],

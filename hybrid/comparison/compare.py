@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from hybrid.comparison.evaluation import Evaluator, Level, find_static_pixels, mean_error, store_flows, store_reference
+from hybrid.comparison.evaluation import Evaluator, Level, mean_error, store_flows, store_reference
 from hybrid.comparison.ladder import build_ladder
 from hybrid.comparison.methods import METHODS, Method
 from hybrid.comparison.results import Comparison, Ladder, MethodResult, Statistic
@@ -72,26 +72,24 @@ def compare_shot(
             run_in_process(_check_sizes, shot, inputs)
             store_reference(store, halves, numbers)
             pairs = run_in_process(store_flows, store, shot, numbers)
-            static = find_static_pixels(store, numbers, pairs, options.exposure)
             findings = [*options.findings, *(check.result() if check is not None else ())]
-        evaluator = Evaluator(store, numbers, pairs, options.exposure, static)
+        evaluator = Evaluator(store, numbers, pairs, options.exposure)
+        height, width, _ = store.load(REFERENCE, numbers[0], lazily=True).shape
         load = load_average()
         timed = time_methods(methods, shot, options.rounds, store, on_step)
         statistics = _evaluate(evaluator, {name: methods[name] for name in timed.runs}, on_step)
         law, law_facts = _noise_law(evaluator, statistics, options)
         results = [
-            _measured(name, method, timed.runs[name], statistics[name], law, static.size / 1e6)
+            _measured(name, method, timed.runs[name], statistics[name], law, height * width / 1e6)
             if name in timed.runs
             else MethodResult(name, method.settings, method.family, absent_reason=timed.absent[name])
             for name, method in methods.items()
         ]
         ladder = _measure_ladder(evaluator, methods, statistics, options, on_step)
         mapped = {n: methods[n] for n in timed.runs if options.maps and methods[n].maps is not None}
-        map_facts = _store_all_maps(shot, mapped, evaluator, on_step)
-    height, width = static.shape
+        map_facts = _store_all_maps(shot, mapped, evaluator, on_step, large=height * width > LARGE)
     facts = {
         "Frames": f"{_span(numbers)}, {width} × {height} pixels",
-        "Static pixels": f"{static.mean():.1%}",
         **law_facts,
     }
     if findings:
@@ -248,11 +246,11 @@ def _measured(
 
 
 def _store_all_maps(
-    shot: Frames, methods: Mapping[str, Method], evaluator: Evaluator, on_step: OnStep
+    shot: Frames, methods: Mapping[str, Method], evaluator: Evaluator, on_step: OnStep, *, large: bool
 ) -> dict[str, str]:
-    """Store the maps of methods, of `LARGE` frames those of the middle one; return a fact if some are left out."""
+    """Store the maps of methods, of large frames those of the middle one; return a fact if some are left out."""
     numbers = evaluator.numbers
-    if evaluator.static.size > LARGE:
+    if large:
         numbers = [numbers[len(numbers) // 2]]
     for name, method in methods.items():
         on_step(f"maps of {name}")

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +17,6 @@ from hybrid.comparison.flip import flip_maps
 from hybrid.comparison.results import Statistic, summarize
 from hybrid.comparison.samples import NoiseLaw, decibels, fit_floor, reference_floor
 from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, FLOW, HALVES, REFERENCE, FrameStore
-from hybrid.denoising.plan import STILL
 from hybrid.files.frame import Array, Frame, Frames
 
 Measure = Callable[[Array, metrics.Reference, float], float]  # of image, reference, exposure
@@ -41,10 +39,6 @@ MEASURES: dict[str, Measure] = {
     "smape": lambda x, r, e: metrics.smape(x, _whole(r), exposure=e),
     "mean_bias": lambda x, r, _: metrics.mean_bias(x, _whole(r)),
 }
-# Static light: 9×9 means of the reference change by less than this on the tone curve. Well above their noise (a ninth
-# of the pixels'), well below a visible change.
-STATIC_CHANGE = 0.02
-CHANGE_GAIN = 25  # gain of the map of changes: a change of a fiftieth of the tone curve is black or white
 
 
 @dataclass(frozen=True)
@@ -53,7 +47,6 @@ class Evaluator:
     numbers: Sequence[int]  # frames to evaluate
     pairs: Sequence[tuple[int, int]]  # neighbouring frames with a flow between them, from `store_flows`
     exposure: float  # factor before the tone curve, one for the whole shot
-    static: NDArray[np.bool_]  # (H, W): static pixels, from `find_static_pixels`
 
     def map_flip(self, names: Sequence[str]) -> None:
         """Store the FLIP maps of several methods at once: they share the computations on the reference."""
@@ -67,7 +60,7 @@ class Evaluator:
                 list(threads.map(partial(self._map_change, name), self.numbers))
 
     def measure(self, name: str) -> dict[str, Statistic]:
-        """Measure frames, after `map_flip`; over time only with pairs of frames or static pixels."""
+        """Measure frames, after `map_flip`; over time only with pairs of frames."""
         values: dict[str, list[float]] = {key: [] for key in (*MEASURES, "flip", "temporal_psnr")}
 
         def measure_frame(number: int) -> dict[str, float]:
@@ -81,9 +74,6 @@ class Evaluator:
             values["temporal_psnr"] += threads.map(partial(self._measure_pair, name), self.pairs)
         maps = (self.store.load(name, number, FLIP_MAP) for number in self.numbers)
         values["flip"] += [float(errors.mean(dtype=np.float64)) for errors in maps]
-        if self.static.any():
-            frames = (self.store.load(name, number) for number in self.numbers)
-            values["static_std"] = list(metrics.static_std(frames, self.static, exposure=self.exposure))
         return {key: summarize(series) for key, series in values.items() if series}
 
     def _map_flip(self, names: Sequence[str], number: int) -> None:
@@ -95,8 +85,8 @@ class Evaluator:
     def _map_change(self, name: str, number: int) -> None:
         """Store the map of motion-compensated changes on the tone curve, amplified: (H, W) in [0, 1], 0.5: no change.
 
-        With W the warp of the previous frame, the map is 0.5 + a·mean(T(x_t) − W T(x_{t−1})) over the channels, and 0.5
-        where no motion leads to a pixel. Unlike temporal PSNR it also shows real changes: light, reflections.
+        With W the warp of the previous frame, the map is 0.5 + 25 mean(T(x_t) − W T(x_{t−1})) over the channels, and
+        0.5 where no motion leads to a pixel. Unlike temporal PSNR it also shows real changes: light, reflections.
         """
         current = metrics.tone_map(self.store.load(name, number), self.exposure)
         previous = next((pair[0] for pair in self.pairs if pair[1] == number), None)
@@ -106,7 +96,7 @@ class Evaluator:
             earlier = metrics.tone_map(self.store.load(name, previous), self.exposure).astype(np.float32)
             difference = (current - warp(earlier, motion[..., :2])[0]).mean(axis=2)
             valid = (motion[..., 2] > 0) & np.isfinite(difference)
-            changes[valid] = np.clip(0.5 + CHANGE_GAIN * difference[valid], 0, 1)
+            changes[valid] = np.clip(0.5 + 25 * difference[valid], 0, 1)  # a change of a fiftieth is black or white
         self.store.save(name, number, changes, CHANGE_MAP)
 
     def _measure_pair(self, name: str, pair: tuple[int, int]) -> float:
@@ -185,24 +175,6 @@ def store_flows(store: FrameStore, shot: Frames, numbers: Sequence[int]) -> list
             store.save(REFERENCE, b, np.dstack(motion).astype(np.float32), FLOW)
             pairs.append((a, b))
     return pairs
-
-
-def find_static_pixels(
-    store: FrameStore, numbers: Sequence[int], pairs: Sequence[tuple[int, int]], exposure: float
-) -> NDArray[np.bool_]:
-    """Find pixels (H, W) without motion or change of the reference's light in any frame; none without all flows."""
-    shape = store.load(REFERENCE, numbers[0]).shape
-    if not pairs or len(pairs) < len(numbers) - 1:
-        return np.zeros(shape[:2], bool)
-    least, most = np.full(shape, np.inf), np.full(shape, -np.inf)
-    for number in numbers:
-        tone = cv2.blur(metrics.tone_map(store.load(REFERENCE, number), exposure), (9, 9))
-        least, most = np.minimum(least, tone), np.maximum(most, tone)
-    static = np.all(most - least < STATIC_CHANGE, axis=-1)
-    for _, number in pairs:
-        motion = store.load(REFERENCE, number, FLOW)
-        static &= (np.hypot(motion[..., 0], motion[..., 1]) < STILL) & (motion[..., 2] > 0)
-    return np.asarray(static, bool)
 
 
 def motion_between(previous: Frame, current: Frame) -> tuple[Array, NDArray[np.bool_]] | None:

@@ -34,14 +34,12 @@ RELATIVE = XYZ / XYZ.sum(axis=1, keepdims=True)  # to XYZ over that of white
 OPPONENT = np.array([[0, 116, 0], [500, -500, 0], [0, 200, -200]])  # YCxCz of that, where Y has 16 taken off
 # Contrast sensitivity to Y, Cx and Cz: sums of Gaussians a·√(π/b)·exp(−π²x²/b), x in degrees.
 SENSITIVITY = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.025)))
-FEATURE = 0.082  # degrees: how wide edges and points are
-COLOR_POWER, FEATURE_POWER = 0.7, 0.5
+COLOR_POWER = 0.7
 KNEE, BELOW = 0.4, 0.95  # color errors up to KNEE of the greatest are spread over [0, BELOW]
 BORDER = cv2.BORDER_REPLICATE
 ROWS = 128  # processed at a time: they stay in the processor's cache from filter to filter
 # Pixels: three deviations of the widest Gaussian; the filters of features are narrower.
 _REACH = int(np.ceil(3 * np.sqrt(0.04 / (2 * np.pi**2)) * PIXELS_PER_DEGREE))
-BLACK = 1e-5  # keeps the exposures of a black reference finite, and assumes radiance around 1
 
 
 def flip_maps(images: Sequence[Array], reference: Array, scale: float = 1.0) -> list[Array]:
@@ -83,7 +81,8 @@ def find_exposures(reference: Array) -> NDArray[np.float64]:
     median = np.partition(light, light.size // 2)[light.size // 2]
     a, b, c = (ACES[i] - TOP * ACES[i + 3] for i in range(3))
     level = (-b + np.sqrt(b * b - 4 * a * c)) / (2 * a)
-    first, last = (np.log2(level / max(float(y), BLACK)) for y in (light.max(), median))
+    # 1e-5 keeps the exposures of a black reference finite, and assumes radiance around 1.
+    first, last = (np.log2(level / max(float(y), 1e-5)) for y in (light.max(), median))
     return np.linspace(first, last, max(2, int(np.ceil(last - first))))
 
 
@@ -117,7 +116,7 @@ def _difference(one: _Perceived, other: _Perceived) -> Array:
     above = BELOW + (color - np.float32(KNEE * greatest)) * np.float32((1 - BELOW) / (greatest - KNEE * greatest))
     color = np.where(color < KNEE * greatest, below, above)
     features = cv2.max(cv2.absdiff(one.edges, other.edges), cv2.absdiff(one.points, other.points))
-    features = _power(features * np.float32(1 / np.sqrt(2)), FEATURE_POWER)
+    features = cv2.sqrt(features * np.float32(1 / np.sqrt(2)))
     # OpenCV's logarithm of 0 is finite, and its power is 0.
     return np.asarray(cv2.exp(cv2.log(color) * (1 - features)), np.float32)
 
@@ -181,7 +180,7 @@ def _strength(gray: Array, across: NDArray[np.float64], along: NDArray[np.float6
 @lru_cache(maxsize=1)
 def _feature_filters() -> tuple[NDArray[np.float64], ...]:
     """A Gaussian, its first and its second derivative; what is positive sums to 1, what is negative to −1."""
-    sigma = 0.5 * FEATURE * PIXELS_PER_DEGREE
+    sigma = 0.5 * 0.082 * PIXELS_PER_DEGREE  # edges and points are 0.082 degrees wide
     reach = int(np.ceil(3 * sigma))
     x = np.arange(-reach, reach + 1)
     wide = np.exp(-(x**2) / (2 * sigma**2))

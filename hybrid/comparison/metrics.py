@@ -23,12 +23,6 @@ Array = NDArray[np.floating]
 Reference = Array | tuple[Array, Array]
 
 EPSILON = 1e-2  # prevents division by zero at black; assumes radiance around 1 after the exposure
-# A half of more than ten times the other is a firefly: the bias is a second-order term of little noise, and would put
-# such a pixel's whole light into the errors of 200 pixels around it.
-BIAS_RATIO = 10.0
-BIAS_SIGMA = 2.0  # pixels: deviation of the Gaussian that averages the bias of noisy halves
-LEVEL = 0.95  # coverage of bootstrap intervals
-RESAMPLES = 2000
 
 
 def tone_map(x: Array, exposure: float = 1.0) -> NDArray[np.float64]:
@@ -110,20 +104,6 @@ def temporal_psnr(
     return np.array(values)
 
 
-def static_std(frames: Iterable[Array], static: NDArray[np.bool_], *, exposure: float = 1.0) -> NDArray[np.float64]:
-    """Standard deviation over time of static pixels, on the tone curve, frame by frame; NaN where undefined.
-
-    RMS over pixels and channels of each frame's distance to the mean over time, times √(N / (N − 1)): the mean of the
-    squares is the unbiased variance over time.
-    """
-    values = [tone_map(frame[static], exposure) for frame in frames]
-    count = len(values)
-    if count < 2 or not static.any():
-        return np.full(count, np.nan)
-    mean = sum(values) / count
-    return np.array([np.sqrt(np.mean((v - mean) ** 2) * count / (count - 1)) for v in values])
-
-
 def mean_over_shots(values: Sequence[float] | Array, shots: Sequence[int] = ()) -> float:
     """Average the means of the shots, of which `shots` has the numbers of values; none: all are of one shot."""
     data = np.asarray(values, np.float64)
@@ -146,19 +126,18 @@ def bootstrap_interval(values: Sequence[float] | Array, *, shots: Sequence[int] 
     if np.isnan(data).any():
         return float("nan"), float("nan")
     rng = np.random.default_rng(0)
-    parts = _by_shot(data, shots)
+    parts, resamples = _by_shot(data, shots), 2000
 
     def draw(part: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(part[rng.integers(0, part.size, (RESAMPLES, part.size))].mean(axis=1))
+        return np.asarray(part[rng.integers(0, part.size, (resamples, part.size))].mean(axis=1))
 
     if len(parts) == 1:
         means = draw(parts[0])
     else:
-        drawn = [rng.integers(0, len(parts), RESAMPLES) for _ in parts]
+        drawn = [rng.integers(0, len(parts), resamples) for _ in parts]
         means = np.mean([np.choose(shot, [draw(part) for part in parts]) for shot in drawn], axis=0)
     # An order statistic without interpolation, which would make NaN of two infinite PSNRs.
-    tails = [(1 - LEVEL) / 2, (1 + LEVEL) / 2]
-    low, high = np.quantile(means, tails, method="inverted_cdf")
+    low, high = np.quantile(means, [0.025, 0.975], method="inverted_cdf")
     return float(low), float(high)
 
 
@@ -187,8 +166,7 @@ def _tone_errors(image: Array, reference: Reference, exposure: float) -> list[ND
 
     T is concave: halves with noise of variance v give tone-mapped images that are T'' v / 2 too dark, which would
     favor dark images. The curve of the halves' mean has half of that bias, so twice the difference is all of it
-    (Quenouille 1956, doi:10.1093/biomet/43.3-4.353, the jackknife); averaged over `BIAS_SIGMA` pixels against variance,
-    without pixels whose halves differ by more than `BIAS_RATIO`.
+    (Quenouille 1956, doi:10.1093/biomet/43.3-4.353, the jackknife); averaged over some pixels against variance.
     """
     x, a, b = _checked(image, reference)
     tone = tone_map(x, exposure)
@@ -196,8 +174,10 @@ def _tone_errors(image: Array, reference: Reference, exposure: float) -> list[ND
         return [tone - tone_map(a, exposure)]
     halves = [tone_map(half, exposure) for half in (a, b)]
     difference = 2 * tone_map((a + b) / 2, exposure) - halves[0] - halves[1]
-    difference[np.maximum(a, b) > BIAS_RATIO * np.minimum(a, b)] = 0
-    bias = np.asarray(cv2.GaussianBlur(difference, (0, 0), BIAS_SIGMA), np.float64)
+    # A half of more than ten times the other is a firefly: the bias is a second-order term of little noise, and would
+    # put such a pixel's whole light into the errors of 200 pixels around it.
+    difference[np.maximum(a, b) > 10 * np.minimum(a, b)] = 0
+    bias = np.asarray(cv2.GaussianBlur(difference, (0, 0), 2.0), np.float64)
     return [tone - half - bias for half in halves]
 
 

@@ -39,7 +39,6 @@ from hybrid.comparison.store import CHANGE_MAP, MAP_TITLES, REFERENCE, FrameStor
 from hybrid.files.frame import Array
 from hybrid.files.replace import check_outputs, write_file
 
-RATES = (4, 12, 24, 25, 30, 60)  # frames per second that the page offers
 MOVIES = "movies"  # folder next to the page
 FILES = ("report.html", "results.json", "chart.png", "ladder.png")
 
@@ -151,7 +150,7 @@ def _page(
         ladder_rows=tables.ladder_rows(comparison.ladder),
         shots=_shot_table([comparison, *report.others]),
         **embedded,
-        rates=sorted({*RATES, report.rate}),
+        rates=sorted({4, 12, 24, 25, 30, 60, report.rate}),
         fps=report.rate,
         data=to_plain_numbers(data),
     )

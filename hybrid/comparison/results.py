@@ -84,7 +84,6 @@ METRICS: tuple[Metric, ...] = (
     Metric("smape", "SMAPE", digits=4, better="lower"),
     Metric("flip", "FLIP", digits=4, better="lower"),
     Metric("mean_bias", "Bias", digits=4, better="zero"),
-    Metric("static_std", "Static deviation", better="lower", logarithmic=True),
 )
 INPUT_FAMILY = "Input"
 OTHER_FAMILIES = ("OIDN", "External")  # denoisers of others

@@ -40,23 +40,6 @@ def test_worth_in_samples_follows_the_levels() -> None:
     assert "measured levels" in comparison.facts["Reference"]
 
 
-def test_static_pixels_flicker_by_what_was_put_in() -> None:
-    """A still shot whose reference stands still: the deviation over time is that of the noise put in."""
-    _, clean = make_shots(tuple(range(1, 9)))
-    sigma = 0.02
-    rng = np.random.default_rng(3)
-    frames = {}
-    for number, frame in clean.frames.items():
-        tone = frame.color / (1 + frame.color) + sigma * rng.normal(size=frame.color.shape)
-        vectors = np.zeros((*SIZE, 4), np.float32)
-        color = (tone / (1 - tone)).astype(np.float32)
-        frames[number] = Frame(number, color, motion=vectors, motion_convention=CYCLES)
-    comparison = compare_shot(MemoryShot(frames), clean, NOISY)
-    assert comparison.facts["Static pixels"] == "100.0%"
-    # 2304 values × 7 degrees of freedom: a standard error of 0.6 %.
-    assert comparison.results[0].metrics["static_std"].mean == pytest.approx(sigma, rel=0.03)
-
-
 def test_what_changes_between_frames_is_kept_as_a_map(tmp_path: Path) -> None:
     """A wall is brighter by 1/100 of the tone curve on one frame: a quarter above gray there, and below after it."""
     tones = {1: 0.5, 2: 0.5, 3: 0.51, 4: 0.5, 6: 0.5}
@@ -102,7 +85,7 @@ def test_the_shots_exposure_reaches_every_measure() -> None:
     (exposed,) = compare_shot(darker(shot), darker(reference), NOISY, CompareOptions(exposure=2.0**20)).results
     (dark,) = compare_shot(darker(shot), darker(reference), NOISY).results
     keys = set(expected.metrics) - {"mean_bias"}
-    assert keys == {"psnr", "ssim", "relmse", "relmse_trimmed", "smape", "flip", "temporal_psnr", "static_std"}
+    assert keys == {"psnr", "ssim", "relmse", "relmse_trimmed", "smape", "flip", "temporal_psnr"}
     for key in keys:
         assert exposed.metrics[key].values == pytest.approx(expected.metrics[key].values, rel=1e-4), key
         assert dark.metrics[key].mean != pytest.approx(expected.metrics[key].mean, rel=1e-2), key
@@ -176,9 +159,8 @@ def test_without_vectors_there_is_no_temporal_figure() -> None:
     shot, reference = make_shots()
     still = {n: replace(f, motion=None, motion_convention=None) for n, f in shot.frames.items()}
     comparison = compare_shot(MemoryShot(still), reference, NOISY)
-    assert not {"temporal_psnr", "static_std"} & set(comparison.results[0].metrics)
+    assert "temporal_psnr" not in comparison.results[0].metrics
     assert "psnr" in comparison.results[0].metrics
-    assert comparison.facts["Static pixels"] == "0.0%"
 
 
 class TestMotionBetween:

@@ -20,7 +20,6 @@ from hybrid.comparison.metrics import (
     relmse,
     smape,
     ssim,
-    static_std,
     temporal_psnr,
     tone_map,
 )
@@ -191,7 +190,6 @@ def still(count: int) -> tuple[list[NDArray[np.float32]], list[NDArray[np.bool_]
 def test_still_perfect_shot_is_perfect(rng: np.random.Generator) -> None:
     shot = [texture(rng)] * 4
     assert (temporal_psnr(shot, shot, *still(4)) == np.full(3, np.inf)).all()
-    assert (static_std(shot, np.ones(SIZE, bool)) == np.zeros(4)).all()
 
 
 def test_error_that_stays_is_no_flicker(rng: np.random.Generator) -> None:
@@ -206,20 +204,6 @@ def test_flicker_of_known_size_is_recovered(size: float, rng: np.random.Generato
     scores = temporal_psnr(shot, [expand(tone)] * 6, *still(6))
     # float32 radiance behind the curve is exact to 1e-7, 1e-4 of the smaller flicker.
     np.testing.assert_allclose(scores, -20 * np.log10(size), atol=2e-3)
-    # Half the steps up, half down: s/2 about the mean, and 6/5 for the unbiased variance of six frames.
-    np.testing.assert_allclose(static_std(shot, np.ones(SIZE, bool)), size / 2 * np.sqrt(6 / 5), rtol=2e-3)
-
-
-def test_static_std_counts_static_pixels_only(rng: np.random.Generator) -> None:
-    sigma, mask = 0.01, np.zeros(SIZE, bool)
-    mask[:, :20] = True
-    tone = np.full((*SIZE, 3), 0.4)
-    shot = [tone + sigma * rng.normal(size=tone.shape) for _ in range(20)]
-    for t, frame in enumerate(shot):
-        frame[:, 20:] = 0.04 * t  # moves, and is masked out
-    # 2400 values × 19 degrees of freedom: a standard error of 0.3 %, five of them allowed.
-    found = static_std((expand(f) for f in shot), mask)
-    assert np.sqrt(np.mean(found**2)) == pytest.approx(sigma, rel=0.016)
 
 
 def test_flow_leads_back_to_the_previous_frame(rng: np.random.Generator) -> None:
@@ -280,9 +264,7 @@ def test_temporal_measures_are_nan_where_a_frame_is(rng: np.random.Generator) ->
     scores = temporal_psnr(shot, [reference] * 4, *still(4))
     assert np.isnan(scores[:2]).all()
     assert scores[2] == np.inf
-    assert np.isnan(static_std(shot, np.ones(SIZE, bool))).all()
     empty = np.zeros(SIZE, bool)
-    assert np.isnan(static_std([reference] * 3, empty)).all()
     assert np.isnan(temporal_psnr([reference] * 2, [reference] * 2, still(2)[0], [empty])).all()
 
 
@@ -328,7 +310,7 @@ def test_bootstrap_over_shots_is_as_wide_as_they_differ(rng: np.random.Generator
 
 
 def test_a_firefly_in_one_of_two_references_adds_no_error_around_it(rng):
-    """Without `BIAS_RATIO` the exact image scores 48 dB."""
+    """Without the bound on the ratio of the halves the exact image scores 48 dB."""
     truth = rng.uniform(0.2, 0.8, (40, 40, 3))
     halves = [truth * rng.normal(1, 0.001, truth.shape) for _ in range(2)]
     halves[0][20, 20] = 50
