@@ -5,7 +5,10 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+
+from numba import types
+from numba.np.numpy_support import as_dtype
 
 from hybrid.runtime.signatures import FILE
 
@@ -16,7 +19,7 @@ import json, sys
 from hybrid.runtime.threads import prepare_libraries
 prepare_libraries()
 from hybrid.cli import main
-from hybrid.runtime.signatures import describe_type
+from tests.signatures import describe_type
 from numba.core.caching import NullCache
 from numba.core.dispatcher import Dispatcher
 
@@ -30,6 +33,19 @@ for name, module in sorted(sys.modules.items()):
                     print(json.dumps([f"{name}.{attribute}", [describe_type(one) for one in signature]]))
 sys.exit(code)
 """
+
+
+def describe_type(type_: Any) -> Any:
+    """Return a numba type as JSON, as `hybrid.runtime.signatures.parse_type` reads it; ValueError for other types."""
+    if isinstance(type_, types.Array) and type_.mutable and type_.layout in "AC":
+        return f"{as_dtype(type_.dtype).name}[{type_.ndim}]{type_.layout.replace('C', '')}"
+    if isinstance(type_, types.BaseTuple):
+        parts = [describe_type(part) for part in cast(Any, type_)]
+        named = getattr(type_, "instance_class", None)
+        return parts if named is None else {f"{named.__module__}.{named.__qualname__}": parts}
+    if isinstance(type_, types.Number | types.Boolean):
+        return as_dtype(type_).name
+    raise ValueError(f"{type_} has no short form, expected a scalar, an array that can be written to, or a tuple")
 
 
 def called_loops(folder: Path) -> list[tuple[str, Any]]:

@@ -7,11 +7,11 @@ import json
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numba import types
-from numba.np.numpy_support import as_dtype, from_dtype
+from numba.np.numpy_support import from_dtype
 
 FILE = Path(__file__).with_name("signatures.json")
 
@@ -30,26 +30,12 @@ def count_listed() -> int:
     return len(json.loads(FILE.read_text(encoding="utf-8")))
 
 
-def describe_type(type_: Any) -> Any:
-    """Return a numba type as JSON.
+def parse_type(described: Any) -> Any:
+    """Return the numba type of a description.
 
     A scalar is the name of its dtype, an array ``"float32[3]"``, with ``A`` behind it if it is not C-contiguous, a
-    tuple a list, a named tuple ``{"module.Class": [...]}``. Raises ValueError for other types, as those of arrays that
-    cannot be written to.
+    tuple a list, a named tuple ``{"module.Class": [...]}``.
     """
-    if isinstance(type_, types.Array) and type_.mutable and type_.layout in "AC":
-        return f"{as_dtype(type_.dtype).name}[{type_.ndim}]{type_.layout.replace('C', '')}"
-    if isinstance(type_, types.BaseTuple):
-        parts = [describe_type(part) for part in cast(Any, type_)]
-        named = getattr(type_, "instance_class", None)
-        return parts if named is None else {f"{named.__module__}.{named.__qualname__}": parts}
-    if isinstance(type_, types.Number | types.Boolean):
-        return as_dtype(type_).name
-    raise ValueError(f"{type_} has no short form, expected a scalar, an array that can be written to, or a tuple")
-
-
-def parse_type(described: Any) -> Any:
-    """Return the numba type that `describe_type` has described."""
     if isinstance(described, dict):
         ((name, parts),) = described.items()
         return _tuple_of(parts, _find(name))

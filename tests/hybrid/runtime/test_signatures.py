@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numba import typeof, types
 
-from hybrid.runtime.signatures import FILE, describe_type, listed_loops, parse_type
+from hybrid.runtime.signatures import FILE, listed_loops, parse_type
 from nlm.samples import SampleMean
-from tests.signatures import called_loops
+from tests.signatures import called_loops, describe_type
 
 PLANE, PICTURE = np.zeros((2, 3), np.float32), np.zeros((2, 3, 3), np.float32)
 VALUES = {
