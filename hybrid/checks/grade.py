@@ -9,15 +9,6 @@ from numpy.typing import NDArray
 Array = NDArray[np.float32]
 
 TILE = 8  # sides of the tiles whose means are compared: the mean of 64 pixels has an eighth of a pixel's noise
-FEWEST = 16  # fewer tiles are no evidence
-LIT = 0.01  # tiles below this share of the mean light are excluded: empty areas are equal in any grade
-# Levels that differ by less than this factor, or by fewer standard errors, are no grade: denoisers are off by some
-# percent, and skewed noise moves a median by as much. The stage that restores the mean corrects them.
-LEVEL, ERRORS = 1.1, 5.0
-ONE_LEVEL = 1.5  # frames whose levels relative to their samples differ by more than this factor have no common grade
-# Median deviation of tiles from one factor, in units of the logarithm, plus a multiple of their noise; above it no
-# factor explains half of the light.
-SPREAD, NOISE = 0.15, 1.0
 
 
 class Grade(NamedTuple):
@@ -39,23 +30,26 @@ def find_grade(pictures: Sequence[tuple[Array, Array]]) -> Grade | None:
     """
     tiles = [_tiles(*pair) for pair in pictures]
     levels = [np.log(part[1].sum() / part[0].sum()) for part in tiles if part[0].sum() > 0 and part[1].sum() > 0]
-    if levels and max(levels) - min(levels) > np.log(ONE_LEVEL):
+    if levels and max(levels) - min(levels) > np.log(1.5):
         return None  # the frames differ among themselves: each is checked when it is read
     e, s, noise = (np.concatenate(parts) for parts in zip(*tiles, strict=True))
     factors, graded = [], False
     for c in range(3):
-        lit = (e[:, c] > LIT * max(float(e[:, c].sum()), 0) / max(len(e), 1)) & (e[:, c] > 0) & (s[:, c] > 0)
-        if np.count_nonzero(lit) < FEWEST:
+        # Tiles below a hundredth of the mean light are excluded: empty areas are equal in any grade.
+        lit = (e[:, c] > 0.01 * max(float(e[:, c].sum()), 0) / max(len(e), 1)) & (e[:, c] > 0) & (s[:, c] > 0)
+        if np.count_nonzero(lit) < 16:  # fewer tiles are no evidence
             factors.append(1.0)
             continue
         weights, ratio = e[lit, c], np.log(s[lit, c] / e[lit, c])
         middle = _median(ratio, weights)
         spread = _median(np.abs(ratio - middle), weights)
-        if spread > SPREAD + NOISE * _median(noise[lit, c] / s[lit, c], weights):
+        # Beyond the noise of the tiles: no factor explains half of the light.
+        if spread > 0.15 + _median(noise[lit, c] / s[lit, c], weights):
             return Grade(None, "differs from the samples by another curve than one factor for each channel")
         total = float(np.log(s[lit, c].sum() / weights.sum()))
-        # 1.5: spread of a normal distribution, 1.25: error of its median.
-        least = max(np.log(LEVEL), ERRORS * 1.5 * 1.25 * spread / np.sqrt(np.count_nonzero(lit)))
+        # Denoisers are off by some percent, and skewed noise moves a median by as much: a tenth is no grade, nor are
+        # five standard errors. 1.5: spread of a normal distribution, 1.25: error of its median.
+        least = max(np.log(1.1), 5 * 1.5 * 1.25 * spread / np.sqrt(np.count_nonzero(lit)))
         graded |= min(abs(middle), abs(total)) > least and middle * total > 0
         factors.append(float(np.exp(middle)))
     if not graded:

@@ -10,13 +10,11 @@ from hybrid.files.passes import BEAUTY, Passes, Sum
 from nlm.average import replace_nonfinite
 from nlm.parts import few_differ, find_sums, is_noisy, is_textured, share_outside, shares_noise
 
-_BAND, _ROWS = 27, 540  # height of the bands of rows in which frames are sampled, and most rows of all bands together
-
 
 def sample_rows(frame: Frame) -> Frame:
-    """Return color, albedo and AOVs of a frame, finite; of a tall frame some bands of rows."""
+    """Return color, albedo and AOVs of a frame, finite; of a tall frame bands of 27 rows, about 540 rows in all."""
     height = frame.color.shape[0]
-    rows = np.arange(height) // _BAND % -(-height // _ROWS) == 0
+    rows = np.arange(height) // 27 % -(-height // 540) == 0
 
     def cut(layer: Array) -> Array:
         return replace_nonfinite(layer[rows])[0]

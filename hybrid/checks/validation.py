@@ -40,27 +40,9 @@ THIN, EDGE_ROWS = 270, 540
 # A layer whose values lie within this of each other, relative to the largest, is constant: half floats round by 5e-4.
 SAME = 1e-3
 STRAY = 0.01  # share of pixels beyond its range that a layer may have: filters with negative lobes overshoot at edges
-# Reflectance is below 1; emitters and skies are written as brighter albedos by some, but not as half of a picture.
-BRIGHT = 2.0
-LENGTH = 1.1  # averages over a pixel are shorter than 1, rounding makes them longer by less than this
-# Correlation of edges, of a guide with the colors of two frames: on the bundled shot an albedo has 0.61 with its own
-# frame and 0.17 to 0.29 with the next, a normal 0.49 and 0.35. Below the second nothing matches: at few samples
-# albedos of rooms have 0.00 to 0.07 with their own frame, and by chance up to 0.20 with the next.
-EDGES, MATCH = 0.05, 0.3
-# The variance may differ from that of the picture by this factor: the third quartile of their ratio was 1.3 to 1.7.
-VARIANCE = 4.0
-# The mean of a denoised picture may differ from that of the noisy one by this factor. The light of single bright
-# samples is uncertain: so it must differ by so many standard errors too (of independent pixels, where a renderer's
-# filter and denoisers make neighbours alike), and by a share of the brightest frame around it, whose light leaks into a
-# dark one.
-LIGHT, ERRORS, LEAK = 2.5, 10.0, 0.05
-# Log curves of cameras and ACEScct encode black as 0.07 to 0.125, and all light below 1.5. Pixels without light then
-# share the least value: at least this share of the picture. Blender's gray world, 0.051, is not in the range.
-LOG_BLACK, LOG_WHITE, LOG_SHARE = (0.06, 0.13), 1.5, 1e-3
+# The mean of a denoised picture may differ from that of the noisy one by this factor.
+LIGHT = 2.5
 LOST = 0.01  # share of its pixels that an estimate may have lost
-SHOWN = 6  # number of motion conventions that are listed
-# Two pictures of which so many pixels are equal are the same, black pixels excluded: empty areas of all layers agree.
-EQUAL = 0.99
 
 
 @dataclass(frozen=True)
@@ -90,7 +72,7 @@ class ValidationReport:
         return tuple(finding.message for finding in self.findings if finding.warning)
 
     def readings(self) -> list[tuple[str, str, str]]:
-        """Rows of the best motion conventions, with the chosen one: "taken" or "", convention, unexplained share."""
+        """Rows of the six best motion conventions, and the chosen one: "taken" or "", convention, unexplained share."""
         if self.motion is None:
             return []
         chosen = self.motion.convention
@@ -100,7 +82,7 @@ class ValidationReport:
             fitted = trial.convention.scale not in SCALES and any(
                 plain == replace(other.convention, scale=1.0) for other in listed
             )
-            if trial.convention == chosen or (not fitted and len(listed) < SHOWN):
+            if trial.convention == chosen or (not fitted and len(listed) < 6):
                 listed.append(trial)
         rows = [(trial.convention == chosen, str(trial.convention), trial.unexplained) for trial in listed]
         rows.append((False, "no motion", self.motion.still))
@@ -282,7 +264,7 @@ class _Checks:
         findings = [*variance_findings, *grade_findings]
         blacks = [black for black in self.log_blacks if black is not None]
         if blacks and len(blacks) == len(self.log_blacks):
-            fault = f"looks encoded by a log curve (black is {blacks[0]:.3f}, nothing is above {LOG_WHITE:g}): averages"
+            fault = f"looks encoded by a log curve (black is {blacks[0]:.3f}, nothing is above 1.5): averages"
             fault += " of it are too dark; write scene-linear color, or convert it (oiiotool --colorconvert)"
             findings.append(Finding("color", f"{self._name('color')} {fault}", left_out=False))
         for role, messages in self.wrong.items():
@@ -316,13 +298,14 @@ class _Checks:
             return None, []
         ratio = float(np.quantile(np.concatenate(self.variances), 0.75))
         said = f"is {ratio:.3g} times that of the picture"
-        if 1 / VARIANCE <= ratio <= VARIANCE:
+        # The third quartile of the ratio was 1.3 to 1.7 with right variances.
+        if 1 / 4 <= ratio <= 4:
             return None, []
         samples, stated = self.layers.samples, self.layers.variance_scale is not None
         if self.layers.variance_of == "sample" and not stated and ratio > 1:
             message = f"{self._name('variance')} {said}, as the variance of samples is: divided by that"
             return 1 / ratio, [Finding("variance", message, warning=False, left_out=False)]
-        if self.layers.variance_of is None and samples and 1 / VARIANCE <= ratio / samples <= VARIANCE:
+        if self.layers.variance_of is None and samples and 1 / 4 <= ratio / samples <= 4:
             message = f"{self._name('variance')} {said}: read as the variance of {samples:g} samples"
             return 1 / samples, [Finding("variance", message, left_out=False)]
         return None, [self._leave_out("variance", said)]
@@ -382,10 +365,12 @@ def _thin(frame: Frame) -> Frame:
 def _find_log_black(color: Array) -> float | None:
     """The value of black in a color that seems to be encoded by a log curve; None in others."""
     least, greatest = float(color.min()), float(color.max())
-    if not (LOG_BLACK[0] <= least <= LOG_BLACK[1] and greatest <= LOG_WHITE and greatest > LOG_BLACK[1]):
+    # Log curves of cameras and ACEScct encode black as 0.07 to 0.125, and all light below 1.5. Blender's gray world,
+    # 0.051, is not in the range.
+    if not 0.06 <= least <= 0.13 < greatest <= 1.5:
         return None
     black = (color <= least * (1 + SAME)).all(axis=-1)
-    return least if black.mean() >= LOG_SHARE else None
+    return least if black.mean() >= 1e-3 else None  # pixels without light share the least value
 
 
 def _shrink(layer: Array) -> Array:
@@ -420,7 +405,10 @@ def _match_edges(edges: Sequence[Array], shown: Sequence[Array]) -> _EdgeMatch:
 def _other_frame(edges: Sequence[_EdgeMatch]) -> str | None:
     """Name the frame, other than their own, whose edges pairs have; None if there is none."""
     centre, late, early = np.mean(edges, axis=0)
-    if max(late, early) <= max(centre + EDGES, MATCH):
+    # On the bundled shot an albedo has 0.61 with its own frame and 0.17 to 0.29 with the next, a normal 0.49 and 0.35.
+    # Below 0.3 nothing matches: at few samples albedos of rooms have 0.00 to 0.07 with their own frame, and by chance
+    # up to 0.20 with the next.
+    if max(late, early) <= max(centre + 0.05, 0.3):
         return None
     figures = f"their edges correlate {max(late, early):.2f}, with its own frame's {centre:.2f}"
     return f"the {'previous' if late > early else 'next'} frame ({figures})"
@@ -444,22 +432,24 @@ def _check_albedo(layer: Array, _: Array) -> str | None:
         return fault
     if (below := float(np.mean(layer.min(axis=-1) < -SAME))) > STRAY:
         return f"is negative in {below:.1%} of the picture"
-    if (above := float(np.mean(layer.max(axis=-1) > BRIGHT))) > 0.5:
-        return f"is above {BRIGHT:g} in {above:.1%} of the picture"
+    # Emitters and skies are written as brighter albedos by some, but not as half of a picture.
+    if (above := float(np.mean(layer.max(axis=-1) > 2))) > 0.5:
+        return f"is above 2 in {above:.1%} of the picture"
     return None
 
 
 def _check_normal(layer: Array, _: Array) -> str | None:
     if (fault := _check_guide(layer)) is not None:
         return fault
-    long = float(np.mean(np.einsum("yxc,yxc->yx", layer, layer) > LENGTH**2))
+    # Averages over a pixel are shorter than 1, rounding makes them longer by less than a tenth.
+    long = float(np.mean(np.einsum("yxc,yxc->yx", layer, layer) > 1.1**2))
     return f"is longer than 1 in {long:.1%} of the picture" if long > STRAY else None
 
 
 def _check_alpha(layer: Array, color: Array) -> str | None:
     if layer.min() == layer.max():
         return None  # opaque everywhere, or empty
-    if any(_equal_share(layer, color[..., c], np.asarray(layer == color[..., c], bool)) > EQUAL for c in range(3)):
+    if any(_equal_share(layer, color[..., c], np.asarray(layer == color[..., c], bool)) > 0.99 for c in range(3)):
         return "is the color"
     outside = float(np.mean((layer < -STRAY) | (layer > 1 + STRAY)))
     return f"is not between 0 and 1 in {outside:.1%} of the picture" if outside > STRAY else None
@@ -475,7 +465,7 @@ def _check_variance(layer: Array, _: Array) -> str | None:
 def _check_estimate(layer: Array, color: Array) -> str | None:
     # Half floats are rounded by 5e-4 of their value.
     same = np.asarray(np.isclose(layer, color, rtol=SAME, atol=0).all(axis=-1), bool)
-    return "is the noisy picture" if _equal_share(layer, color, same) > EQUAL else None
+    return "is the noisy picture" if _equal_share(layer, color, same) > 0.99 else None
 
 
 def _equal_share(a: Array, b: Array, same: Mask) -> float:
@@ -526,8 +516,8 @@ def find_lost_light(picture: Array, noisy: Array, valid: Mask, around: Callable[
     """Report the channel in which a denoised picture has another brightness than the noisy one; None if none.
 
     `around` returns the mean of the brightest picture whose light may have leaked in; it is called only in doubt. With
-    means a of the picture and b of the noisy one, where `valid`, a channel is at fault where |a − b| exceeds `ERRORS`
-    standard errors of b and `LEAK` times `around`, and a > `LIGHT`·b or b > `LIGHT`·a.
+    means a of the picture and b of the noisy one, where `valid`, a channel is at fault where |a − b| exceeds ten
+    standard errors of b and a twentieth of `around`, and a > `LIGHT`·b or b > `LIGHT`·a.
     """
     if (count := np.count_nonzero(valid)) == 0:
         return None
@@ -535,9 +525,11 @@ def find_lost_light(picture: Array, noisy: Array, valid: Mask, around: Callable[
     a, b = (np.array(cv2.mean(image, mask)[:3]) for image in (picture, noisy))  # summed in float64
     if ((a <= LIGHT * b) & (b <= LIGHT * a)).all():
         return None
+    # The light of single bright samples is uncertain. Errors are of independent pixels, where a renderer's filter and
+    # denoisers make neighbours alike.
     error = cv2.meanStdDev(noisy, mask=mask)[1].ravel() / np.sqrt(count)
-    leak = LEAK * around()
-    far = np.abs(a - b) > np.maximum(ERRORS * error, leak)
+    leak = 0.05 * around()
+    far = np.abs(a - b) > np.maximum(10 * error, leak)
     faulty = far & ((a > LIGHT * b) | (b > LIGHT * a)) & ((b > 0) | (leak > 0))
     for index in np.flatnonzero(faulty):
         share = f"{a[index] / b[index]:.2g} times the light" if b[index] > 0 else "light where none was rendered"

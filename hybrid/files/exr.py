@@ -30,10 +30,6 @@ from hybrid.runtime.streams import open_standard_streams
 # 16384 × 16384: four times the area of the largest frames that are rendered (IMAX, LED walls), and small enough that a
 # hundred-byte file which claims to be 2^31 pixels wide is refused before anything is allocated.
 MAX_PIXELS = 2**28
-_MAX_SIDE = 2**16
-_MAX_TILE = 2**13
-# All channels of all parts together. Allows 16 float channels at MAX_PIXELS, 500 at 4K.
-_MAX_BYTES_PER_PIXEL = 64
 
 HALF_MAX = 65504.0
 # Compressions that change values each time they are written; PXR24 does not change values that it has written.
@@ -304,8 +300,8 @@ def read_exr(path: str | Path, *, pixels: bool = True, max_pixels: int = MAX_PIX
     with path.open("rb") as file:
         if file.read(4) != _MAGIC:
             raise ExrError(f"{path}: not an OpenEXR file")
-    OpenEXR.setMaxImageSize(_MAX_SIDE, _MAX_SIDE)
-    OpenEXR.setMaxTileSize(_MAX_TILE, _MAX_TILE)
+    OpenEXR.setMaxImageSize(2**16, 2**16)
+    OpenEXR.setMaxTileSize(2**13, 2**13)
     headers = _open(path, header_only=True)
     _refuse_unusable(path, headers, max_pixels)
     return ExrImage(path, _open(path, header_only=False) if pixels else headers)
@@ -366,7 +362,7 @@ def _refuse_unusable(path: Path, parts: tuple[Part, ...], max_pixels: int) -> No
         total += height * width * 4 * len(part.channels)
     if not any(part.channels for part in parts):
         raise ExrError(f"{path}: no channels")
-    if total > _MAX_BYTES_PER_PIXEL * max_pixels:
+    if total > 64 * max_pixels:  # allows 16 float channels at MAX_PIXELS, 500 at 4K
         raise ExrError(f"{path}: decodes to {total / 2**30:.0f} GiB, too much")
 
 

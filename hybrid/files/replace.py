@@ -12,8 +12,6 @@ from pathlib import Path
 from hybrid.runtime.system import is_reserved, lock_file, open_file, replace_path, same_file, sync_file
 
 _unfinished: set[Path] = set()  # temporary files and folders of this process
-# Length of a file's name that its temporary name repeats, so that this stays within the 255 bytes that folders allow.
-_KEPT = 24
 _TEMPORARY = re.compile(r"\..+\.ravg-[0-9a-f]{16}\.tmp", re.DOTALL)
 _LOCK = ".lock"
 
@@ -146,8 +144,9 @@ def remove_leftovers(folder: Path) -> None:
 def _create(path: Path, suffix: str = "") -> tuple[Path, int]:
     """Make a file with an unguessable name in the folder of `path`; return it, open and locked."""
     while True:
-        # Unguessable, and never opened if it exists: nobody can have placed a link there to write through.
-        name = f".{path.name[:_KEPT]}.ravg-{secrets.token_hex(8)}.tmp{suffix}"
+        # Unguessable, and never opened if it exists: nobody can have placed a link there to write through. With all of
+        # the file's name it might be longer than the 255 bytes that folders allow.
+        name = f".{path.name[:24]}.ravg-{secrets.token_hex(8)}.tmp{suffix}"
         temporary = path.with_name(name)
         _unfinished.add(temporary)
         try:

@@ -24,7 +24,6 @@ HASHED = 2**20
 _BLOCKS = 16
 # Packages that all pixels depend on.
 PACKAGES = ("ravg", "numpy", "numba", "opencv-contrib-python-headless", "scikit-image")
-_SECONDS = 2.0  # archives and older file systems keep times in steps of up to two seconds
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,8 @@ class Source:
     def same_as(self, other: Self) -> bool:
         """Whether size, hash and time are the same, the time to two seconds; names may differ."""
         same = self.size == other.size and self.hash == other.hash
-        return same and abs(self.modified - other.modified) <= _SECONDS
+        # Archives and older file systems keep times in steps of up to two seconds.
+        return same and abs(self.modified - other.modified) <= 2
 
 
 class ReadSources:

@@ -11,13 +11,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-_MULTI_PART = 0x1000  # bit of the version field: several parts, each with a header, and one more that is empty
 _HEADERS = 2**24  # headers and tables of offsets lie within so many bytes; reading headers needs nothing behind them
 
 
 def find_strings(data: bytes) -> Iterator[tuple[int, str, slice]]:
     """Yield part, name and byte range of each string attribute up to where the data is truncated or malformed."""
-    several = bool(int.from_bytes(data[4:8], "little") & _MULTI_PART)
+    # A bit of the version field: several parts, each with a header, and one more that is empty.
+    several = bool(int.from_bytes(data[4:8], "little") & 0x1000)
     part, at = 0, 8
     while at < len(data):
         if data[at] == 0:  # the end of a header; an empty header ends the last part

@@ -28,7 +28,6 @@ from hybrid.run.job import DEFAULTS, DenoiseOptions, choose_first_pass, open_den
 Layers = Sequence[Mapping[str, Array]] | Mapping[int, Mapping[str, Array]]  # layers of each frame, by index or number
 # Names of layers that are no AOVs.
 LAYERS = ("color", "albedo", "normal", "depth", "motion", "variance", "alpha", "estimate")
-ALIKE = 0.8  # similarity by `difflib` from which on a name is a known one with a slip: "albdeo" has 0.83, "diffuse" 0.3
 
 
 class ArrayFrames:
@@ -71,7 +70,8 @@ class ArrayFrames:
         """A frame; ValueError where a layer does not fit the others."""
         layers = self._arrays(number)
         for name in layers:
-            if name not in LAYERS and (near := get_close_matches(str(name).lower(), LAYERS, 1, ALIKE)):
+            # A known name with a slip is this similar: "albdeo" has 0.83, "diffuse" 0.3.
+            if name not in LAYERS and (near := get_close_matches(str(name).lower(), LAYERS, 1, 0.8)):
                 raise ValueError(f"frame {number}: layer {name!r} is unknown, expected {near[0]}? (or an AOV's name)")
         if "color" not in layers:
             raise ValueError(f"frame {number}: expected the layer color, got {', '.join(layers) or 'none'}")

@@ -13,8 +13,6 @@ from hybrid.files.png import Image8, encode_bytes, write_png
 from hybrid.files.shots import Shot, output_path
 from nlm.average import replace_nonfinite
 
-RATE = 24.0  # frames per second of a movie without --fps, as in film and Blender
-SWEEP = 4.0  # seconds of the divider's way from left to right and back
 SHORTEST = 48  # frames of a movie; shorter shots are repeated
 SHEET_FRAMES, SHEET_WIDTH = 24, 320  # frames of a contact sheet at most, and pixels of their width
 
@@ -33,7 +31,7 @@ def check_png(path: Path, what: str) -> None:
         raise ValueError(f"{what} {path}: expected a name that ends in .png")
 
 
-def write_preview(shot: Shot, output: str | Path, path: Path, *, rate: float = RATE) -> None:
+def write_preview(shot: Shot, output: str | Path, path: Path, *, rate: float = 24.0) -> None:
     """Write the middle frame as a .png, noisy left and denoised right, or a .mp4 or .webp with a moving divider.
 
     Movies play at `rate` frames per second. All frames have one exposure, at which the middle noisy frame has a mean of
@@ -103,7 +101,7 @@ def _wipe(pairs: _Pairs, rate: float) -> Iterator[Image8]:
     numbers = pairs.noisy.numbers
     rounds = max(1, SHORTEST // len(numbers))
     total = rounds * len(numbers)
-    sweeps = max(1, round(total / rate / SWEEP))
+    sweeps = max(1, round(total / rate / 4))  # the divider's way from left to right and back takes four seconds
     read = cache(pairs.read) if rounds > 1 else pairs.read
     for index in range(total):
         noisy, denoised = read(numbers[index % len(numbers)])

@@ -26,7 +26,6 @@ NAMELESS = "frames"  # name of a sequence whose file names are numbers alone
 ALL_PACKAGES = (*PACKAGES, "OpenEXR", "pyoidn", "torch")  # all packages whose versions are recorded
 UNTRIED = "not tried"
 STATES = "finished", "running", "failed", "missing", UNTRIED  # of a frame; missing: finished, and its file is gone
-LONGEST = 60  # a longer list of frames is named by its ends and a hash in the record's name
 
 
 class Record:
@@ -234,8 +233,9 @@ def _is_amount(value: Any) -> bool:
 
 
 def _range(numbers: Sequence[int]) -> str:
+    """The frames in the record's name: a long list by its ends and a hash."""
     text = format_frames(numbers).replace(":", "y")
-    if len(text) <= LONGEST:
+    if len(text) <= 60:
         return text
     return f"{numbers[0]}-{numbers[-1]}_{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 

@@ -21,7 +21,6 @@ from loops.parallel import thread_count
 LOG = logging.getLogger("ravg")
 
 MOST = 6  # helpers: the longest loop takes a seventh of the time of all
-SECONDS = 45  # CPU time in which one core of a Zen 3 compiles all loops of `balanced`
 
 
 class FirstRun(event.Listener):
@@ -40,7 +39,7 @@ class FirstRun(event.Listener):
         if self.begun:
             return
         self.begun = True
-        seconds = -(-SECONDS // min(thread_count(), MOST + 1))
+        seconds = -(-45 // min(thread_count(), MOST + 1))  # CPU time of one core of a Zen 3 for `balanced`
         LOG.info(
             f"compiling for this processor, in the first run only: up to {count_listed()} loops, about {seconds} s"
         )

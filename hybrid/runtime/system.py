@@ -23,7 +23,6 @@ else:
 
 # Seconds to wait while another program has a frame open: a viewer, a virus scanner, an indexer.
 _PATIENCE = 2.0
-_INTERVAL = 0.05
 
 if sys.platform == "win32":
     import ctypes
@@ -134,7 +133,7 @@ def replace_path(source: Path, target: Path) -> None:
                 raise type(error)(error.errno, "the file there is read-only", str(source)) from None
             if time.monotonic() >= end:
                 raise
-            time.sleep(_INTERVAL)
+            time.sleep(0.05)
 
 
 def is_read_only(path: Path) -> bool:

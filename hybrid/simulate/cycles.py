@@ -26,12 +26,9 @@ from hybrid.simulate import scenes
 from hybrid.simulate.effects import EVERYTHING, PASSES, effects_of, facts_of, needed_bounces, settings_of
 from hybrid.simulate.shot import RANDOM, ShotSettings, frame_seed
 
-ATTEMPTS = 8  # random shots of one seed that are tried
 PILOT_SAMPLES = 8
 PILOT_PIXELS = 2400  # with 8 samples 19 thousand paths: a few tenths of a second, most of it to set up
-PILOT_BOTH_ENDS = 30e6  # samples of a shot above which the pilot may take the time for two frames
 SAMPLES = "cycles.ViewLayer.samples"  # Cycles' header attribute; it counts one render, which may be a part
-GUIDE_SAMPLES = 16  # of the unblurred pass: edges are antialiased, and nothing is lit
 
 
 def configure(scene: Any, settings: dict[str, Any], threads: int) -> None:
@@ -140,7 +137,7 @@ def make_plan(shot: ShotSettings, threads: int) -> dict[str, Any]:
     """
     started = time.perf_counter()
     exposure: dict[str, Any] = {}
-    for attempt in range(ATTEMPTS):
+    for attempt in range(8):
         description = build(shot, attempt, threads)
         scene = bpy.context.scene
         scene.frame_set(shot.middle)
@@ -162,7 +159,7 @@ def make_plan(shot: ShotSettings, threads: int) -> dict[str, Any]:
         # Both ends, if something moves and there is much to render: what comes into view may need deeper paths.
         moves = facts.motion_pixels > 0 or facts.moving_lights
         work = shot.size[0] * shot.size[1] * sum(sum(shot.renders(frame).values()) for frame in shot.frames)
-        both_ends = moves and work > PILOT_BOTH_ENDS
+        both_ends = moves and work > 30e6  # samples
         frames = sorted({shot.frames[0], shot.frames[-1]}) if both_ends else [shot.middle]
         cleanest = max([*shot.levels.values(), shot.reference])
         bounces = needed_bounces(lambda s, seed: pilot(scene, frames, s, seed), settings, PILOT_SAMPLES, cleanest)
@@ -222,10 +219,11 @@ def render_level(scene: Any, shot: ShotSettings, path: Path, samples: int, seed:
             render_frame(scene, partial, samples, seed)
             header, channels = read_channels(partial) if blur else ({}, {})
         if blur:
-            # With blur, Cycles writes no vectors and smears guides. This pass needs no light but mirrors.
+            # With blur, Cycles writes no vectors and smears guides. This pass needs no light but mirrors, and few
+            # samples for its edges.
             lit = {"render.use_motion_blur": True, "cycles.diffuse_bounces": scene.cycles.diffuse_bounces}
             apply(scene, {"render.use_motion_blur": False, "cycles.diffuse_bounces": 0})
-            render_frame(scene, partial, min(samples, GUIDE_SAMPLES), seed)
+            render_frame(scene, partial, min(samples, 16), seed)
             apply(scene, lit)
             lighting = {name: channels[name] for name in channels if ".Combined." in name or ".Half " in name}
             channels = {**read_channels(partial)[1], **lighting}

@@ -30,13 +30,11 @@ EVERYTHING: dict[str, Any] = {
 BLUR_PIXELS = 0.1  # a tenth of the pixel filter's width cannot be seen through it
 SMALL_LIGHT = 0.1  # radius over distance to the camera: below, a reflection of the light is a caustic
 MIRROR_ROUGHNESS = 0.2  # at roughness 0.2 the lobe is some 5° wide: light it focuses is still sharp
-TREE_LIGHTS = 2  # with one light there is nothing to choose between
 
 # The cost of truncated paths: six figures of 0.05 % stay well within the 0.5 % by which all of them together may
 # change the mean; a tenth of the noise is not significant in a two-seed test of ten frames.
 MEAN_FRACTION = 0.0005
 NOISE_FRACTION = 0.1
-PROBES = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24)  # depths tried; the shallowest sufficient one is taken
 BLOCK = 8  # pixels
 
 
@@ -93,7 +91,7 @@ def effects_of(facts: SceneFacts) -> list[EffectDecision]:
     blur_reason = ("moves while the shutter is open" if moves else "nothing moves") if facts.blur_asked else ""
     surfaces, sharp = facts.glossy + facts.transmissive, facts.mirrors + facts.transmissive
     caustics = {"cycles.caustics_reflective": facts.glossy > 0, "cycles.caustics_refractive": facts.transmissive > 0}
-    many, lit = facts.lights >= TREE_LIGHTS, facts.world != "none"
+    many, lit = facts.lights >= 2, facts.world != "none"  # with one light there is nothing to choose between
     return [
         EffectDecision("motion blur", opens, blurred, f"{BLUR_PIXELS:g} px", blur_reason or "not asked for",
                        {"render.use_motion_blur": opens}),
@@ -115,7 +113,7 @@ def effects_of(facts: SceneFacts) -> list[EffectDecision]:
         _counted("volumes", facts.volumes, "materials with a volume, or the world", "cycles.volume_bounces"),
         _counted("subsurface", facts.subsurface, "materials; Cycles needs no switch for it"),
         _counted("hair", facts.hair, "objects; Cycles needs no switch for it"),
-        EffectDecision("light tree", many, facts.lights, TREE_LIGHTS, "lights to choose between",
+        EffectDecision("light tree", many, facts.lights, 2, "lights to choose between",
                        {"cycles.use_light_tree": many}),
         EffectDecision("sky", lit, facts.world, "shines",
                        "the world is sampled as a light" if lit else "the world is black",
@@ -178,7 +176,8 @@ def needed_bounces(
             continue
         # No kind of bounce can happen more often than all together; transparent ones are counted separately.
         deepest = settings[name] if kind in ("max", "transparent") else lean["cycles.max_bounces"]
-        depths = [depth for depth in PROBES if depth < deepest]
+        # The shallowest sufficient one is taken.
+        depths = [depth for depth in (0, 1, 2, 3, 4, 6, 8, 12, 16, 24) if depth < deepest]
         base = {**settings, "cycles.max_bounces": lean["cycles.max_bounces"]}
         low, high, figures = 0, len(depths), (0.0, 0.0)
         while low < high:  # bisection: the lost light falls with the depth

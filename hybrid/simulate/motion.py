@@ -79,7 +79,6 @@ def place_camera(rng: Rng, focus: Vector, eye: Vector) -> Any:
 
 
 Pose = tuple[Vector, Euler, float]  # shift in camera space, in units of the distance; turn; zoom (logarithm)
-CAMERA_MOVES = {"pan": 3.0, "dolly": 3.0, "orbit": 2.0, "handheld": 2.0, "zoom": 0.8, "roll": 0.4}
 
 
 def camera_path(rng: Rng, kind: str) -> Callable[[float, float], Pose]:
@@ -289,7 +288,8 @@ def add_motion(rng: Rng, shot: ShotSettings, own_objects: bool) -> dict[str, Any
     if kind == "light" or (kind == "usual" and rng.random() < 0.08):
         found["lights"].append(move_light(rng, shot))
     if kind in ("usual", "mirror") and (rng.random() < 0.8 or not found["moving_objects"]):
-        found["camera"] = weighted_choice(rng, CAMERA_MOVES)
+        moves = {"pan": 3.0, "dolly": 3.0, "orbit": 2.0, "handheld": 2.0, "zoom": 0.8, "roll": 0.4}
+        found["camera"] = weighted_choice(rng, moves)
         small = shot.size[0] == scene.render.resolution_x
         pixels = log_uniform(rng, 1, 12 if small else 25)
         found["camera_pixels"] = round(move_camera(rng, shot, found["camera"], pixels), 2)

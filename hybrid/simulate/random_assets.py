@@ -95,7 +95,8 @@ def _new_image(name: str, pixels: np.ndarray, linear: bool = False) -> Any:
 
 def texture(rng: assets.Rng, tree: Any, coordinates: Any, scale: float) -> tuple[Any, Any]:
     """Add a texture of `scale` features per unit of the coordinates; return its color and its scalar socket."""
-    kind = weighted_choice(rng, TEXTURES)
+    kinds = {"Noise": 4, "Voronoi": 2, "Wave": 1.5, "Checker": 1, "Brick": 1.5, "Magic": 0.5, "Image": 3}
+    kind = weighted_choice(rng, kinds)
     made = assets.node(tree, f"Tex{kind}")
     if kind == "Image":
         made.image, made.projection = painted_image(rng), "BOX"
@@ -133,7 +134,6 @@ def texture(rng: assets.Rng, tree: Any, coordinates: Any, scale: float) -> tuple
     return ramp.outputs["Color"], scalar
 
 
-TEXTURES = {"Noise": 4, "Voronoi": 2, "Wave": 1.5, "Checker": 1, "Brick": 1.5, "Magic": 0.5, "Image": 3}
 SURFACES = {
     "diffuse": 0.28, "plastic": 0.24, "metal": 0.14, "mirror": 0.04, "glass": 0.07, "subsurface": 0.07,
     "coated": 0.08, "velvet": 0.04, "emission": 0.04,

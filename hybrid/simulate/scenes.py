@@ -239,8 +239,6 @@ SETS: dict[str, tuple[float, Callable[[assets.Rng], View]]] = {
     "wall": (0.12, wall_set),
 }
 HARD = {"hair": 0.21, "glass": 0.21, "metal": 0.19, "lens": 0.19, "volume": 0.06, "dim": 0.14}
-HAIRY = {"sphere": 2.0, "monkey": 1.0, "blob": 1.0}
-SHAPES = {"turned": 4, "sphere": 1, "torus": 1.5, "monkey": 1.5, "box": 1, "cage": 1, "blob": 1, "text": 0.5}
 # The materials of what each of HARD adds; None is a random one.
 SURFACES: dict[str, tuple[str | None, ...]] = {
     "hair": ("diffuse",),
@@ -248,7 +246,6 @@ SURFACES: dict[str, tuple[str | None, ...]] = {
     "metal": ("metal", "metal", "mirror"),
     "lens": (None,),
 }
-FILMS = {"1920x1080": 0.6, "2048x1152": 0.12, "2560x1440": 0.1, "0x0": 0.18}  # 0x0: no more than is rendered
 CREDIT = ("title", "author", "licence", "licence_url", "original")
 
 
@@ -274,7 +271,9 @@ def random_shot(shot: ShotSettings, attempt: int) -> dict[str, Any]:
     camera = place_camera(rng, view.focus, view.eye)
     film = shot.film
     if film is None:
-        width, height = map(int, weighted_choice(rng, FILMS).split("x"))
+        # 0x0: no more than is rendered.
+        films = {"1920x1080": 0.6, "2048x1152": 0.12, "2560x1440": 0.1, "0x0": 0.18}
+        width, height = map(int, weighted_choice(rng, films).split("x"))
         film = max(width, shot.size[0]), max(height, shot.size[1])
     center = frame_crop(rng, shot, film)
     added = [motion for name in hard for motion in make_hard(hard_rng, shot, name)]
@@ -319,9 +318,12 @@ def make_hard(rng: assets.Rng, shot: ShotSettings, name: str) -> list[dict[str, 
         return []
     motions = []
     surfaces = SURFACES[name]
+    shapes = {"turned": 4, "sphere": 1, "torus": 1.5, "monkey": 1.5, "box": 1, "cage": 1, "blob": 1, "text": 0.5}
+    if name == "hair":
+        shapes = {"sphere": 2.0, "monkey": 1.0, "blob": 1.0}
     for _ in range(int(rng.integers(2, 5))):
         surface = surfaces[int(rng.integers(len(surfaces)))]
-        item = add_floating(rng, shot, surface, weighted_choice(rng, HAIRY if name == "hair" else SHAPES))
+        item = add_floating(rng, shot, surface, weighted_choice(rng, shapes))
         if name == "hair":
             add_random_fur(rng, item)
         if rng.random() < 0.75:
