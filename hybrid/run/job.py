@@ -52,8 +52,6 @@ PRESETS: dict[str, tuple[str, ...]] = {
     "classical": ("standard", "draft", "final"),
 }
 METHOD_OF_PRESET = {preset: method for method, presets in PRESETS.items() for preset in presets}
-FIRST_PASS_OF_METHOD = {"network": "auto", "classical": "none"}
-CHOICES = {"precision": ("auto", "float32", "bfloat16"), "aov_sum": ("layers", "beauty")}
 LIMITS = {"passes": (1, math.inf), "tile": (16, math.inf), "threads": (1, MOST_THREADS)}
 # Types of option values: those accepted for each, and their names in messages.
 ACCEPTED: dict[type, type | tuple[type, ...]]
@@ -121,7 +119,7 @@ class DenoiseOptions:
         if preset not in PRESETS[method]:
             expected = ", ".join(PRESETS[method])
             raise ValueError(f"preset is {preset!r}, expected one of {expected} with method {method}")
-        first_pass = self.first_pass or FIRST_PASS_OF_METHOD[method]
+        first_pass = self.first_pass or ("auto" if method == "network" else "none")
         for name, value in (("method", method), ("preset", preset), ("first_pass", first_pass)):
             object.__setattr__(self, name, value)
         check_first_pass(first_pass)
@@ -136,7 +134,10 @@ class DenoiseOptions:
                 if isinstance(value, str) or not isinstance(value, Iterable):
                     raise ValueError(f"{name} is {value!r}, expected a list of names")
                 object.__setattr__(self, name, tuple(value))
-            elif get_origin(hint) is not Literal:  # choices are checked by value
+            elif get_origin(hint) is Literal:
+                if value not in (choices := get_args(hint)):
+                    raise ValueError(f"{name.replace('_', '-')} is {value!r}, expected one of {', '.join(choices)}")
+            else:
                 kinds = get_args(hint) or (hint,)
                 accepted = any(isinstance(value, ACCEPTED[kind]) for kind in kinds)
                 if not accepted or (isinstance(value, bool) and bool not in kinds):
@@ -146,9 +147,6 @@ class DenoiseOptions:
                     object.__setattr__(self, name, Path(value) if Path in kinds else str(value))
 
     def _check_values(self) -> None:
-        for name, expected in CHOICES.items():
-            if (chosen := getattr(self, name)) not in expected:
-                raise ValueError(f"{name.replace('_', '-')} is {chosen!r}, expected one of {', '.join(expected)}")
         for name, (least, most) in LIMITS.items():
             if (number := getattr(self, name)) is not None and not least <= number <= most:
                 bound = f"at least {least}" if number < least else f"at most {most}"
@@ -514,7 +512,7 @@ class Job:
     def plan_memory(self) -> MemoryPlan:
         """How the run stays within its limit, if it has one; ValueError where not even a band of rows fits."""
         if self.options.max_memory is None:
-            return MemoryPlan(None, in_files=False, background=True)
+            return MemoryPlan()
         return plan_memory(
             parse_size(self.options.max_memory) // len(self.views),
             self.views[0],
@@ -542,7 +540,7 @@ class Job:
         """
         options, runs, done, total = self.options, self.options.passes, 0, self.total()
         views = [View(shot, source.first_pass) for shot, source in zip(self.views, self.first_passes, strict=True)]
-        settings = RunSettings(**self.plan_memory()._asdict(), attributes=self.header())
+        settings = RunSettings(self.plan_memory(), attributes=self.header())
         home = output_path(self.output, self.views[0], self.views[0].numbers[0]).parent
         with ExitStack() as stack:
             for run, margin in enumerate(self.margins(), start=1):

@@ -40,9 +40,10 @@ def parse_size(text: str) -> int:
 class MemoryPlan(NamedTuple):
     """How a run stays within its limit."""
 
-    rows: int | None  # of a frame that are worked on at a time, a multiple of 64; None for all
-    in_files: bool  # whether the values that later windows read lie in temporary files, and freed memory is returned
-    background: bool  # whether the next frame is read, and the last one written, while a frame is worked on
+    rows: int | None = None  # of a frame that are worked on at a time, a multiple of 64; None for all
+    # whether the values that later windows read lie in temporary files, and freed memory is returned to the system
+    in_files: bool = False
+    background: bool = True  # whether the next frame is read, and the last one written, while a frame is worked on
 
 
 def plan_memory(

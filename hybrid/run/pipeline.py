@@ -19,6 +19,7 @@ from hybrid.files.prefetch import Prefetcher
 from hybrid.files.replace import remove_leftovers
 from hybrid.files.shots import Shot, output_path
 from hybrid.files.sources import MADE_FROM, Source, describe_sources, why_stale
+from hybrid.run.memory import MemoryPlan
 from hybrid.runtime.kept import Keeper
 from hybrid.runtime.timing import Timings
 
@@ -66,10 +67,7 @@ class View(NamedTuple):
 class RunSettings:
     """How frames are read, denoised and written; none of it changes a pixel."""
 
-    rows: int | None = None  # how many rows of a frame to work on at a time (`memory.plan_memory`); None for all
-    in_files: bool = False  # whether values that later windows read lie in files, and freed memory is returned
-    # whether to read and write in the background, which takes the memory of one frame read and one written
-    background: bool = True
+    memory: MemoryPlan = field(default_factory=MemoryPlan)
     # leave frames alone that are there, whole, and would be the same: with these attributes, of the same files
     resume: bool = False
     # where a frame cannot be read, denoised or written, go on with the next; one that cannot be read counts as missing
@@ -126,7 +124,7 @@ def denoise_frames(
             else:
                 done.append(result)
             del result  # or the result would still be there while the next window is denoised
-            yield from done if settings.background else (*done, *writer.finish())
+            yield from done if settings.memory.background else (*done, *writer.finish())
         yield from writer.finish()
 
 
@@ -175,7 +173,7 @@ class _ShotDenoiser:
         self.ahead = self.support - REACH - ("whiten" in rules.allowed)
         self.lost: dict[int, Exception] = {}  # frames that could not be read, which count as missing
         self.sources = sources_of(views, radius, rules, settings.sources, self.lost)
-        keeper = Keeper(in_files=settings.in_files)
+        keeper = Keeper(in_files=settings.memory.in_files)
 
         def follow(view: View) -> tuple[Prefetcher, FrameDenoiser]:
             reader = Prefetcher(view.shot, thread, timings, self.lost)
@@ -190,7 +188,8 @@ class _ShotDenoiser:
                 keeper=keeper,
             )
             going = settings.keep_going
-            return reader, FrameDenoiser(stream, denoise, rows=settings.rows, keep_going=going, strength=strength)
+            rows = settings.memory.rows
+            return reader, FrameDenoiser(stream, denoise, rows=rows, keep_going=going, strength=strength)
 
         self._follow = follow
         self._begin()
@@ -271,7 +270,7 @@ class _ShotDenoiser:
         """Read ahead the frames that the result of a frame needs."""
         # The outermost are read only where something shines in the one beside them, or by a later window, and the one
         # whose noise is compared has been read before.
-        near = self.shot.neighbours(number, self.ahead) if self.settings.background else ()
+        near = self.shot.neighbours(number, self.ahead) if self.settings.memory.background else ()
         for reader in self.readers:
             reader.expect(near)
 

@@ -105,7 +105,7 @@ def test_a_run_keeps_to_its_plan_of_memory(shot_folder, tmp_path, monkeypatch, p
     monkeypatch.setattr(job, "denoise_frames", lambda *words, **_: iter(asked.append(words[4]) or ()))
     options = job.DenoiseOptions(preset="draft", max_memory="8G")
     assert list(job.Job.open(open_shot(shot_folder), tmp_path / "out", options).run()) == []
-    assert [(made.rows, made.in_files, made.background) for made in asked] == [plan]
+    assert [made.memory for made in asked] == [plan]
 
 
 def test_the_number_of_threads_is_that_which_was_asked_for(shot_folder, tmp_path, monkeypatch):

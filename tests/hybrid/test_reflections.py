@@ -11,6 +11,7 @@ from hybrid.denoising.first_pass import PerFrame
 from hybrid.denoising.plan import DENOISED, NOISY, Rules
 from hybrid.denoising.stream import FrameStream, plan_shot
 from hybrid.files.shots import open_shot
+from hybrid.run.memory import MemoryPlan
 from hybrid.runtime.timing import Timings
 from tests.scenes import Scene, denoise_view, grained
 
@@ -87,7 +88,8 @@ def test_bands_of_rows_make_no_difference(tmp_path):
 
     shot = open_shot(replace(WALL, height=520).write(tmp_path / "in", edit=shine_low))
     for rows in (None, 64):
-        made = list(denoise_view(shot, tmp_path / str(rows), AverageDenoiser(Timings()), RULES, FIRST_PASS, rows=rows))
+        denoise, out = AverageDenoiser(Timings()), tmp_path / str(rows)
+        made = list(denoise_view(shot, out, denoise, RULES, FIRST_PASS, memory=MemoryPlan(rows)))
         assert made[3].plan.shares["reflections"] > 0
     whole, bands = (open_shot(tmp_path / str(rows)).read(MIDDLE).color for rows in (None, 64))
     np.testing.assert_array_equal(bands, whole)
