@@ -146,7 +146,6 @@ def compare(
         check_shot=lambda: [
             finding.message for finding in log_cuts(run_in_process(plan_shot, noisy), (), strict=strict)
         ],
-        maps=report.output is not None,
     )
     reuse_freed_memory()
     bar = Progress("compare", count_steps(chosen, options), "steps")

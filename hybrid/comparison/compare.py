@@ -21,7 +21,6 @@ from hybrid.files.sources import versions
 from hybrid.runtime.system import load_average, processor_name
 
 VERSIONS = ("numpy", "numba", "opencv-contrib-python-headless", "scikit-image", "torch", "pyoidn")
-LARGE = 1 << 20  # pixels of a frame; above, maps of all frames would take longer than the rest of a comparison
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,6 @@ class CompareOptions:
     # returns further findings; called in the background while reference and motion are read. An exception ends the
     # comparison before any method runs.
     check_shot: Callable[[], Sequence[str]] | None = None
-    maps: bool = False  # store the methods' maps
 
 
 def compare_shot(
@@ -86,23 +84,20 @@ def compare_shot(
             for name, method in methods.items()
         ]
         ladder = _measure_ladder(evaluator, methods, statistics, options, on_step)
-        mapped = {n: methods[n] for n in timed.runs if options.maps and methods[n].maps is not None}
-        map_facts = _store_all_maps(shot, mapped, evaluator, on_step, large=height * width > LARGE)
     facts = {
         "Frames": f"{_span(numbers)}, {width} × {height} pixels",
         **law_facts,
     }
     if findings:
         facts["Layers"] = "; ".join(findings)
-    facts |= map_facts | _facts_of_runs(options, load)
+    facts |= _facts_of_runs(options, load)
     return Comparison(options.title, tuple(results), facts, ladder, tuple(numbers))
 
 
 def count_steps(methods: Mapping[str, Method], options: CompareOptions) -> int:
-    """Return the most steps of a comparison: reading, runs, FLIP, measuring, levels, maps."""
+    """Return the most steps of a comparison: reading, runs, FLIP, measuring, levels."""
     levels = len(options.levels) * (1 + len(_methods_of_levels(methods))) if options.ladder else 0
-    maps = sum(method.maps is not None for method in methods.values()) if options.maps else 0
-    return 1 + options.rounds * len(methods) + 1 + len(methods) + levels + maps
+    return 1 + options.rounds * len(methods) + 1 + len(methods) + levels
 
 
 def _common_frames(shot: Frames, halves: Sequence[Frames]) -> list[int]:
@@ -243,27 +238,6 @@ def _measured(
         metrics=metrics,
         worth=None if law is None or name == "noisy" else law.worth(mean_error(metrics["psnr"].values)),
     )
-
-
-def _store_all_maps(
-    shot: Frames, methods: Mapping[str, Method], evaluator: Evaluator, on_step: OnStep, *, large: bool
-) -> dict[str, str]:
-    """Store the maps of methods, of large frames those of the middle one; return a fact if some are left out."""
-    numbers = evaluator.numbers
-    if large:
-        numbers = [numbers[len(numbers) // 2]]
-    for name, method in methods.items():
-        on_step(f"maps of {name}")
-        run_in_process(_store_maps, method, shot, numbers, name, evaluator.store)
-    if methods and len(numbers) < len(evaluator.numbers):
-        return {"Maps": f"confidence and contribution of frame {numbers[0]} only, because the frames are large"}
-    return {}
-
-
-def _store_maps(method: Method, shot: Frames, numbers: Sequence[int], name: str, store: FrameStore) -> None:
-    for number, maps in method.maps(shot, numbers) if method.maps is not None else ():
-        for title, values in maps.items():
-            store.save(name, number, values, title)
 
 
 def _facts_of_runs(options: CompareOptions, load: float | None) -> dict[str, str]:

@@ -1,11 +1,9 @@
 """Denoisers that `ravg compare` runs, from a shot to denoised frames: parts of ravg, alone and together, and OIDN."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Literal
-
-import numpy as np
 
 from hybrid.alignment.window import AlignedWindow
 from hybrid.denoising.first_pass import (
@@ -29,7 +27,6 @@ if TYPE_CHECKING:
     from hybrid.neural.network_denoiser import NetworkDenoiser
 
 Run = Callable[[Frames], Iterator[tuple[int, Array]]]
-Maps = Callable[[Frames, Sequence[int]], Iterator[tuple[int, dict[str, Array]]]]
 WindowFilter = Callable[[AlignedWindow], Array]  # to (H, W, 3) radiance
 
 
@@ -39,8 +36,6 @@ class Method:
     # picklable. An `ImportError` lists the method as absent.
     run: Run
     family: str  # methods of one family share color and marker on the chart
-    # from a shot and frame numbers to (number, (H, W) maps in [0, 1] by title), for the report
-    maps: Maps | None = None
     # "measured"; "free": the frames exist before any method runs; "unknown": another program made the frames
     cost: Literal["measured", "free", "unknown"] = "measured"
     seconds: float | None = None  # per frame, of "unknown" cost, as its user states them
@@ -86,51 +81,29 @@ def _stream(shot: Frames, first_pass: str, denoiser: "NetworkDenoiser | None" = 
     )
 
 
-@dataclass(frozen=True)
-class Classical:
-    denoise: WindowFilter
-    first_pass: str = "none"
-
-    def __call__(self, shot: Frames) -> Iterator[tuple[int, Array]]:
-        stream = _stream(shot, self.first_pass)
-        for number in shot.numbers:
-            denoised, frame = self.denoise(stream.align(number)), stream.frame(number)
-            assert frame is not None
-            yield number, frame.with_filter(denoised)
-
-    def maps(self, shot: Frames, numbers: Sequence[int]) -> Iterator[tuple[int, dict[str, Array]]]:
-        stream = _stream(shot, self.first_pass)
-        for number in numbers:
-            yield number, window_maps(stream.align(number), self.denoise)
+def filtered(shot: Frames, *, denoise: WindowFilter, first_pass: str = "none") -> Iterator[tuple[int, Array]]:
+    """Yield the frames as a filter makes them of their aligned windows."""
+    stream = _stream(shot, first_pass)
+    for number in shot.numbers:
+        denoised, frame = denoise(stream.align(number)), stream.frame(number)
+        assert frame is not None
+        yield number, frame.with_filter(denoised)
 
 
-@dataclass(frozen=True)
-class Network:
+def network(shot: Frames, *, preset: str, first_pass: str) -> Iterator[tuple[int, Array]]:
     """Denoise with the weights of a preset, and windows of its radius."""
-
-    preset: str
-    first_pass: str = "none"
-
-    def __call__(self, shot: Frames) -> Iterator[tuple[int, Array]]:
-        denoiser = _denoiser(self.preset, "auto")
-        frames = FrameDenoiser(_stream(shot, self.first_pass, denoiser), denoiser)
-        for number in shot.numbers:
-            yield number, frames.make(number).denoised.color
-
-    def maps(self, shot: Frames, numbers: Sequence[int]) -> Iterator[tuple[int, dict[str, Array]]]:
-        """Yield number and `window_maps` of some frames, in float32: differences of runs must exceed rounding."""
-        denoiser = _denoiser(self.preset, "float32")
-        stream = _stream(shot, self.first_pass, denoiser)
-        for number in numbers:
-            yield number, window_maps(stream.align(number), lambda window: denoiser(window).color)
+    denoiser = _denoiser(preset)
+    frames = FrameDenoiser(_stream(shot, first_pass, denoiser), denoiser)
+    for number in shot.numbers:
+        yield number, frames.make(number).denoised.color
 
 
 @lru_cache(maxsize=1)
-def _denoiser(preset: str, precision: str) -> "NetworkDenoiser":
+def _denoiser(preset: str) -> "NetworkDenoiser":
     """A network with the weights of a preset, loaded once."""
     from hybrid import neural  # torch may be absent
 
-    return neural.open_network(neural.find_weights(preset), precision=precision)
+    return neural.open_network(neural.find_weights(preset))
 
 
 def aligned_average(aligned: AlignedWindow) -> Array:
@@ -141,28 +114,6 @@ def aligned_average(aligned: AlignedWindow) -> Array:
 def aligned_robust_average(aligned: AlignedWindow) -> Array:
     """Average over time, without the darkest and the brightest frame of each pixel."""
     return robust_average(aligned.color, aligned.confidence) * aligned.modulation
-
-
-def window_maps(aligned: AlignedWindow, denoise: WindowFilter) -> dict[str, Array]:
-    """Map (H, W), in [0, 1], the confidence in the neighbours of a window, and their contribution to a result.
-
-    "Confidence" is the mean over the neighbours; "Temporal contribution" the fraction of the result that comes from the
-    neighbours: the relative change of the result for a relative change of the neighbours' light. For a
-    weighted mean that is the fraction of their weight in the light, and it is defined for any denoiser.
-    """
-    is_neighbour = np.arange(len(aligned.confidence)) != aligned.middle
-    # Small enough to change no decision, and far above the rounding of float32.
-    step = np.float32(1 / 256)
-    gain = 1 + np.where(is_neighbour, step, 0).astype(np.float32)[:, None, None, None]
-    first_pass = None if aligned.first_pass is None else aligned.first_pass * gain
-    brighter = replace(aligned, aligned_color=aligned.color * gain, first_pass=first_pass)
-    before, after = (denoise(window).mean(axis=-1) for window in (aligned, brighter))
-    change = step * before  # underflows where the result is almost black
-    contribution = np.divide(after - before, change, out=np.zeros_like(before), where=change > 0)
-    return {
-        "Confidence": aligned.confidence[is_neighbour].mean(axis=0),
-        "Temporal contribution": np.clip(contribution, 0, 1).astype(np.float32),
-    }
 
 
 def oidn(shot: Frames, *, quality: Quality = "high", prefilter: Quality | None = None) -> Iterator[tuple[int, Array]]:
@@ -181,14 +132,14 @@ def oidn_then_average(shot: Frames) -> Iterator[tuple[int, Array]]:
 
 
 def _aligned(family: str, denoise: WindowFilter, first_pass: str = "none", **settings: object) -> Method:
-    run = Classical(denoise, first_pass)
+    run = partial(filtered, denoise=denoise, first_pass=first_pass)
     named = {} if first_pass == "none" else {"first pass": first_pass}
-    return Method(run, family, run.maps, settings={"window": 5, **named, **settings})
+    return Method(run, family, settings={"window": 5, **named, **settings})
 
 
 def _network(preset: str, first_pass: str) -> Method:
-    run = Network(preset, first_pass)
-    return Method(run, "Networks", run.maps, settings={"weights": preset, "first pass": first_pass})
+    run = partial(network, preset=preset, first_pass=first_pass)
+    return Method(run, "Networks", settings={"weights": preset, "first pass": first_pass})
 
 
 def _oidn(quality: Quality, prefilter: Quality | None = None) -> Method:

@@ -35,8 +35,7 @@ from hybrid.comparison.results import (
     to_json,
     to_plain_numbers,
 )
-from hybrid.comparison.store import CHANGE_MAP, MAP_TITLES, REFERENCE, FrameStore
-from hybrid.files.frame import Array
+from hybrid.comparison.store import MAP_TITLES, REFERENCE, FrameStore
 from hybrid.files.replace import check_outputs, write_file
 
 MOVIES = "movies"  # folder next to the page
@@ -92,18 +91,14 @@ def report_images(
 ) -> ShotImages:
     """Return the images that `compare_shot` has stored."""
 
-    def load_map(name: str, title: str, number: int) -> Array | None:
-        return store.load(name, number, title) if store.has(name, number, title) else None
+    def images_of(owner: str) -> MethodImages:
+        titles = [title for title in MAP_TITLES if store.has(owner, frames[0], title)]
+        maps = {title: partial(store.load, owner, title=title) for title in titles}
+        return MethodImages(owner, partial(store.load, owner), maps)
 
-    methods = []
-    for result in comparison.results:
-        if result.absent_reason is None:
-            titles = [t for t in MAP_TITLES if any(store.has(result.name, number, t) for number in frames)]
-            maps = {title: partial(load_map, result.name, title) for title in titles}
-            methods.append(MethodImages(result.name, partial(store.load, result.name), maps))
-    changes = {CHANGE_MAP: partial(load_map, REFERENCE, CHANGE_MAP)}
-    there = any(store.has(REFERENCE, number, CHANGE_MAP) for number in frames)
-    return ShotImages(methods, partial(store.load, REFERENCE), frames, exposure, changes if there else {})
+    methods = [images_of(result.name) for result in comparison.results if result.absent_reason is None]
+    reference = images_of(REFERENCE)
+    return ShotImages(methods, reference.frame, frames, exposure, reference.maps)
 
 
 def _embed(folder: Path, report: Report) -> dict[str, Any]:

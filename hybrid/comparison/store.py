@@ -15,7 +15,7 @@ HALVES = ("half a", "half b")  # of a reference that is given in halves
 FLOW = "flow"
 FLIP_MAP = "FLIP"
 CHANGE_MAP = "Change between frames"
-MAP_TITLES = (FLIP_MAP, CHANGE_MAP, "Confidence", "Temporal contribution")
+MAP_TITLES = (FLIP_MAP, CHANGE_MAP)
 
 
 @dataclass(frozen=True)

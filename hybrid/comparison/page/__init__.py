@@ -23,7 +23,6 @@ _templates.policies["json.dumps_kwargs"] = {"ensure_ascii": False}  # without so
 _templates.filters |= {
     "column_title": tables.column_title,
     "value": tables.format_value,
-    "change": tables.format_change,
     "seconds": tables.format_seconds,
     "bytes": tables.format_bytes,
     "worth": tables.format_worth,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,15 +16,10 @@ from hybrid.comparison.methods import Method, external, noisy
 from hybrid.comparison.metrics import mean_bias, psnr, relmse
 from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, MAP_TITLES, REFERENCE, FrameStore
 from hybrid.files.frame import Frame
-from tests.hybrid.comparison.shots import NOISY, SIZE, Array, MemoryShot, make_shots, perfect, ways
+from tests.hybrid.comparison.shots import NOISY, SIZE, MemoryShot, make_shots, perfect, ways
 from tests.hybrid.comparison.test_running import killed, not_installed
 
 # Methods, at module level: they run in another process.
-
-
-def with_maps(shot: MemoryShot, numbers: Sequence[int]) -> Iterator[tuple[int, dict[str, Array]]]:
-    for number in numbers:
-        yield number, {"Confidence": np.full(SIZE, 0.5, np.float32)}
 
 
 def test_every_method_gets_its_figures_or_its_reason(tmp_path: Path) -> None:
@@ -85,45 +79,26 @@ def test_methods_run_on_the_levels_of_a_ladder() -> None:
 
 def test_maps_are_left_for_the_page(tmp_path: Path) -> None:
     shot, reference = make_shots()
-    methods = NOISY | {"mapped": Method(perfect, "Tests", with_maps)}
-    compare_shot(shot, reference, methods, CompareOptions(maps=True), folder=tmp_path)
+    compare_shot(shot, reference, NOISY, folder=tmp_path)
     store = FrameStore(tmp_path)
     assert [title for title in MAP_TITLES if store.has("noisy", 5, title)] == [FLIP_MAP, CHANGE_MAP]
-    assert store.load("mapped", 5, "Confidence").shape == SIZE
-
-
-def test_large_frames_have_maps_in_the_middle_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("matplotlib")
-    from hybrid.comparison.report import report_images
-
-    shot, reference = make_shots()
-    methods = NOISY | {"mapped": Method(perfect, "Tests", with_maps)}
-    monkeypatch.setattr(compare, "LARGE", SIZE[0] * SIZE[1] - 1)
-    comparison = compare_shot(shot, reference, methods, CompareOptions(maps=True), folder=tmp_path)
-    middle = shot.numbers[len(shot.numbers) // 2]
-    assert f"of frame {middle} only" in comparison.facts["Maps"]
-    images = report_images(FrameStore(tmp_path), comparison, shot.numbers)
-    maps = next(image.maps for image in images.methods if image.name == "mapped")
-    assert [number for number in shot.numbers if maps["Confidence"](number) is not None] == [middle]
-    assert all(maps[FLIP_MAP](number) is not None for number in shot.numbers)
+    assert store.load("noisy", 5, FLIP_MAP).shape == SIZE
 
 
 def test_progress_says_what_is_being_done() -> None:
     shot, reference = make_shots()
     told: list[str] = []
-    methods = NOISY | {"mapped": Method(perfect, "Tests", with_maps), "gone": Method(not_installed, "Tests", with_maps)}
-    options = CompareOptions(maps=True)
-    compare_shot(shot, reference, methods, options, on_step=told.append)
-    assert compare.count_steps(methods, options) == 10
+    methods = NOISY | ways(perfect=perfect, gone=not_installed)
+    compare_shot(shot, reference, methods, on_step=told.append)
+    assert compare.count_steps(methods, CompareOptions()) == 8
     assert told == [
         "read the shot, its motion and the reference",
         "run noisy",
-        "run mapped",
+        "run perfect",
         "run gone",
         "FLIP of all methods",
         "measure noisy",
-        "measure mapped",
-        "maps of mapped",  # what is not there is not measured, and has no maps
+        "measure perfect",  # what is not there is not measured
     ]
 
 

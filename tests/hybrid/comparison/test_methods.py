@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import pytest
 
 from hybrid.alignment.window import AlignedWindow
 from hybrid.comparison import methods
-from hybrid.comparison.methods import METHODS, Network, aligned_average, window_maps
+from hybrid.comparison.methods import METHODS
 from hybrid.comparison.metrics import psnr
 from hybrid.denoising.plan import Rules
 from hybrid.denoising.pseudo_reference import filter_window
@@ -19,7 +18,6 @@ from hybrid.denoising.stabilize import Denoised
 from hybrid.denoising.stream import FrameStream
 from hybrid.files.shots import Shot, open_shot
 from hybrid.files.sources import MADE_FROM
-from nlm.average import average
 from tests.exr_files import write_layers
 from tests.scenes import Scene, only
 
@@ -66,33 +64,6 @@ def test_of_ravg_s_own_files_what_it_has_written_is_read(shot: Shot, tmp_path: P
     assert pictures[SCENE.first].mean() == 1
 
 
-class TestMaps:
-    def aligned(self, shot: Shot, confidence: float) -> methods.AlignedWindow:
-        window = FrameStream(shot, only({"demodulate", "warp"}), radius=1).align(SCENE.first + 1)
-        trust = np.full_like(window.confidence, confidence)
-        trust[window.middle] = 1
-        return replace(window, confidence=trust)
-
-    @pytest.mark.parametrize("confidence", [0.0, 0.5, 1.0])
-    def test_contribution_is_the_weight_of_the_other_frames_in_the_light(self, shot: Shot, confidence: float) -> None:
-        aligned = self.aligned(shot, confidence)
-        maps = window_maps(aligned, aligned_average)
-        light = aligned.color * aligned.confidence[..., None] * aligned.modulation
-        expected = 1 - light[aligned.middle].mean(axis=-1) / light.sum(axis=0).mean(axis=-1)
-        # Float32 rounding of the difference of two pictures, over a step of 1/256.
-        np.testing.assert_allclose(maps["Temporal contribution"], expected, atol=2e-4)
-        np.testing.assert_allclose(maps["Confidence"], confidence)
-
-    def test_estimates_of_side_frames_are_contributions_of_theirs(self, shot: Shot) -> None:
-        aligned = self.aligned(shot, 0.0)
-        aligned = replace(aligned, first_pass=np.repeat(aligned.color[1:2], 3, axis=0))
-        alone = window_maps(aligned, lambda window: average(window.first_pass, window.confidence))
-        assert alone["Temporal contribution"].max() == 0
-        trusted = replace(aligned, confidence=np.ones_like(aligned.confidence))
-        maps = window_maps(trusted, lambda window: average(window.first_pass, window.confidence))
-        np.testing.assert_allclose(maps["Temporal contribution"], 2 / 3, atol=2e-4)
-
-
 def test_estimators_of_methods_are_those_of_the_library(shot: Shot) -> None:
     aligned = FrameStream(shot, Rules()).align(SCENE.first)
     np.testing.assert_array_equal(next(METHODS["standard"].run(shot))[1], filter_window(aligned))
@@ -124,8 +95,5 @@ def test_a_network_gets_its_guides_filtered_as_in_a_run(shot: Shot, monkeypatch:
 
     monkeypatch.setattr(methods, "Rules", lambda: only({"demodulate", "warp", "clean-guides"}))
     monkeypatch.setattr(methods, "_denoiser", lambda *settings: Denoiser())
-    network = Network("quality", "nlm")
-    for _ in network(shot):
-        assert guided.pop()
-    for _ in network.maps(shot, shot.numbers[:1]):
+    for _ in methods.network(shot, preset="quality", first_pass="nlm"):
         assert guided.pop()
