@@ -24,7 +24,7 @@ SHARE = 0.94
 # Temporary planes of the fullest steps: pairs of frames are compared before a run (4.9 GiB at 7680×4320), TV-L1 solves
 # for a flow, rows of a window are filtered, samples correct a finished picture. A network takes its own memory beside
 # `BESIDE_NETWORK` planes.
-WORKING, BESIDE_NETWORK = 40, 20
+WORKING, BESIDE_NETWORK = 40, 24
 
 
 def parse_size(text: str) -> int:
@@ -103,8 +103,8 @@ def plan_memory(
         working += min(oidn, 64 * MIB)  # stays when OIDN has made the first pass of a frame
         # Bands leave free memory in more pieces: `fast` takes 1429 MiB at 1920×1080 in bands of 448 rows, in float32.
         working *= 1.1 if rows < height else 1
-        # With frames in memory the final stage takes more than a first pass.
-        first_passes = plane * BESIDE_NETWORK + first_network(shot.shape) if in_files else 0
+        # 14 planes of the frame beside the network of a first pass. With frames in memory the final stage takes more.
+        first_passes = plane * 14 + first_network(shot.shape) if in_files else 0
         steps = max(reading, WORKING if can_refine(stages) else 0)
         at_once = max(plane * steps + oidn, first_passes, plane * max(guides, WORKING), working)
         held += beside if background else 0.0
