@@ -27,7 +27,7 @@ from hybrid.files.layers import summarize_layers
 from hybrid.files.profile import ROLE_FACTS
 from hybrid.files.sequences import format_frames
 from hybrid.files.shots import Shot, output_path
-from hybrid.run.job import DenoiseOptions, Job, Paths, Step, check_paths
+from hybrid.run.job import DenoiseOptions, Job, Step, check_paths
 from hybrid.run.memory import parse_size
 from hybrid.run.pipeline import Failed, Finished
 from hybrid.run.preview import check_png, check_preview, write_contact_sheet, write_preview
@@ -56,10 +56,9 @@ class Request:
                 check_png(self.contact_sheet, "contact-sheet")
 
     @property
-    def paths(self) -> Paths:
-        """Further files that are read and written."""
-        writes = {"preview": self.preview, "contact-sheet": self.contact_sheet, "log-file": log_file()}
-        return Paths({"profile": self.shot.profile}, writes)
+    def further(self) -> dict[str, Path | None]:
+        """Files that are written beside the frames."""
+        return {"preview": self.preview, "contact-sheet": self.contact_sheet, "log-file": log_file()}
 
     def of_views(self) -> list[tuple[str, "Request"]]:
         """Return the stereo views, or "", each with its own request; BadParameter for names that all would share."""
@@ -148,7 +147,7 @@ def _denoise_in_chunks(
     """Denoise the shot, a chunk of its frames in a process, by this command with other parameters."""
     start = time.monotonic()
     shot = request.shot.open()
-    check_paths(shot, request.output, request.options, paths=request.paths)
+    check_paths(shot, request.output, request.options, further=request.further)
     _summarize_shot(request, shot.views[0])
     first = output_path(request.output, shot, shot.numbers[0])
     folder, name = first.parent, sequence_name(first)
@@ -180,7 +179,7 @@ def _denoise(request: Request) -> None:
     """Denoise a shot; leave a record beside the frames however it ends; stopped by Ctrl-C, log what is finished."""
     start = time.monotonic()
     shot = request.shot.open()
-    job = Job.open(shot, request.output, request.options, request.paths, _failure_on_record(request, shot))
+    job = Job.open(shot, request.output, request.options, request.further, _failure_on_record(request, shot))
     _summarize_shot(request, job.views[0])
     _summarize_job(job)
     shots.log_findings(job.report, job.views)

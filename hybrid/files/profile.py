@@ -54,6 +54,7 @@ class Profile:
     samples: str | None = None  # header attribute of the samples per pixel; ``*`` matches anything
     why: str = "asked for"  # why the profile was chosen
     typed: frozenset[str] = frozenset()  # parts of `motion` that the user states
+    file: Path | None = None
 
     def convention(self, channels: int) -> MotionConvention:
         """Return the convention of vectors with so many channels, as far as documented or assumed."""
@@ -124,7 +125,7 @@ def read_profile(path: str | Path) -> Profile:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{path}: not a profile: {error}") from None
     try:
-        return _profile(path.stem, table)
+        return replace(_profile(path.stem, table), file=path)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
 

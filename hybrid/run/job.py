@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, fields, replace
 from numbers import Integral, Real
 from pathlib import Path
-from types import ModuleType, NoneType
+from types import MappingProxyType, ModuleType, NoneType
 from typing import Literal, NamedTuple, Self, get_args, get_origin, get_type_hints
 
 from hybrid.checks.validation import ValidationReport, find_cut, validate_layers
@@ -310,24 +310,16 @@ def choose_first_pass(view: Shot, options: DenoiseOptions, denoiser: WindowDenoi
     )
 
 
-class Paths(NamedTuple):
-    """Files of a run beside its frames, by the names of their options: those read, and those written."""
-
-    reads: Mapping[str, str | Path | None] = {}
-    writes: Mapping[str, Path | None] = {}
-
-
-NO_PATHS = Paths()
-
-
 def check_paths(
     shot: Shot,
     output: str | Path,
     options: DenoiseOptions,
     first_passes: Sequence[FirstPassSource] = (),
-    paths: Paths = NO_PATHS,
+    further: Mapping[str, Path | None] = MappingProxyType({}),
 ) -> None:
     """Refuse, before any pixel is read, a run that would write over its inputs, or that lacks frames.
+
+    `further` are files that are written beside the frames, by the names of their options.
 
     Raises ValueError or OSError as `hybrid.files.replace.check_outputs`; FileNotFoundError if frames were asked for
     that are not there, and `keep_going` is not set.
@@ -339,12 +331,13 @@ def check_paths(
         )
     written = [("output", output_path(output, shot, number)) for number in shot.numbers]
     written += [("keep-first-pass", path) for source in first_passes for path in source.kept]
-    further = {"breakdown": options.breakdown, **paths.writes}
-    written += [(name, Path(path)) for name, path in further.items() if path is not None]
+    beside = {"breakdown": options.breakdown, **further}
+    written += [(name, path) for name, path in beside.items() if path is not None]
     read = [("frame", path) for number in shot.files for path in shot.paths(number)]
     read += [("first-pass", path) for source in first_passes if source.files for path in source.files.files.values()]
-    inputs = {"weights": options.weights_file, **paths.reads}
-    read += [(name, Path(path)) for name, path in inputs.items() if path is not None]
+    profile = shot.reader.files.profile
+    inputs = {"weights": options.weights_file, "profile": None if profile is None else profile.file}
+    read += [(name, path) for name, path in inputs.items() if path is not None]
     check_outputs(written, read)
 
 
@@ -432,19 +425,19 @@ class Job:
         shot: Shot,
         output: str | Path,
         options: DenoiseOptions,
-        paths: Paths = NO_PATHS,
+        further: Mapping[str, Path | None] = MappingProxyType({}),
         validating: AbstractContextManager[object] | None = None,
     ) -> Self:
         """Prepare the process, and validate everything that a job depends on.
 
-        `validating` is entered while frames are read and validated.
+        `further` files are written beside the frames; `validating` is entered while frames are read and validated.
 
         Raises ValueError, OSError or ImportError if an option cannot be had here, a file is damaged or would be
         overwritten, or memory does not suffice.
         """
         prepare_process(options)
         timings, breakdown = Timings(), None if options.breakdown is None else Breakdown()
-        check_paths(shot, output, options, paths=paths)
+        check_paths(shot, output, options, further=further)
         denoiser = open_denoiser(options, timings, breakdown)
         if options.method != "network" and shot.aovs:
             raise ValueError(f"--aov: {options.method} denoises the color alone, expected none, got {shot.aovs[0]!r}")
@@ -459,7 +452,7 @@ class Job:
             options = _fit_budget(views[0], options)
             denoiser = open_denoiser(options, timings, breakdown)
         first_passes = tuple(choose_first_pass(view, options, denoiser) for view in views)
-        check_paths(shot, output, options, first_passes, paths)
+        check_paths(shot, output, options, first_passes, further)
         job = cls(options, str(output), views, report, denoiser, first_passes, timings, breakdown)
         job.plan_memory()
         return job
@@ -592,7 +585,7 @@ def denoise_shot(
     Parameters
     ----------
     shot : Shot
-        From `hybrid.open_shot`. Each view layer and stereo view of its files is denoised.
+        From `ravg.open_shot`. Each view layer and stereo view of its files is denoised.
     output : str or Path
         ``OUT.####.exr``, or a folder.
     options : DenoiseOptions, optional, what is asked for
@@ -615,13 +608,13 @@ def denoise_shot(
 
     Examples
     --------
-    >>> from hybrid import denoise_shot, open_shot
+    >>> from ravg import denoise_shot, open_shot
     >>> shot = open_shot("examples/shot/noisy.####.exr", frames="8-10")
     >>> [frame.path.name for frame in denoise_shot(shot, "out/denoised.####.exr")]
     ['denoised.0008.exr', 'denoised.0009.exr', 'denoised.0010.exr']
     """
     if not isinstance(shot, Shot):
-        raise ValueError(f"shot is {shot!r}, expected a Shot from hybrid.open_shot")
+        raise ValueError(f"shot is {shot!r}, expected a Shot from ravg.open_shot")
     if not isinstance(output, (str, Path)):
         raise ValueError(f"output is {output!r}, expected a pattern such as OUT.####.exr, or a folder")
     return Job.open(shot, output, replace_options(options, changes)).run(progress)
