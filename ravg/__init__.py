@@ -13,6 +13,7 @@ of both are keywords, or a `DenoiseOptions`.
 These names are imported when they are first used, so that ``import ravg`` is quick.
 """
 
+from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,6 +27,13 @@ if TYPE_CHECKING:
     __version__: str
 
 __all__ = ["DenoiseOptions", "__version__", "check_packages", "denoise_arrays", "denoise_shot", "open_shot"]
+
+_MODULES = {
+    "DenoiseOptions": "hybrid.run.job",
+    "denoise_arrays": "hybrid.run.arrays",
+    "denoise_shot": "hybrid.run.job",
+    "open_shot": "hybrid.files.shots",
+}
 
 
 def check_packages() -> None:
@@ -53,11 +61,10 @@ def __dir__() -> list[str]:
 def __getattr__(name: str) -> Any:
     if name == "__version__":
         return version("ravg")
-    if name not in __all__:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     check_packages()
-    import hybrid
     from hybrid.runtime.threads import prepare_libraries
 
     prepare_libraries()
-    return getattr(hybrid, name)
+    return getattr(import_module(_MODULES[name]), name)

@@ -163,7 +163,7 @@ def denoise_arrays(
 ) -> Iterator[ArrayResult]:
     """Denoise frames in memory.
 
-    The pixels are those that `hybrid.denoise_shot` computes from the same layers. AOVs that add up to the color are
+    The pixels are those that `ravg.denoise_shot` computes from the same layers. AOVs that add up to the color are
     scaled to do so again. At most a window of frames is held. Options are checked at once; frames are denoised, and
     their layers checked, while the iterator is consumed.
 
@@ -205,7 +205,7 @@ def denoise_arrays(
     Examples
     --------
     >>> import numpy as np
-    >>> from hybrid import denoise_arrays
+    >>> from ravg import denoise_arrays
     >>> noisy = [{"color": np.random.default_rng(n).gamma(4, 0.25, (32, 48, 3))} for n in range(3)]
     >>> [result.layers["color"].shape for result in denoise_arrays(noisy)]
     [(32, 48, 3), (32, 48, 3), (32, 48, 3)]

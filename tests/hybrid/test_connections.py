@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import hybrid
+import ravg
 from hybrid.alignment.align import align
 from hybrid.alignment.measure import measure_frame as measure
 from hybrid.cli import main
@@ -114,7 +114,7 @@ def test_the_number_of_threads_is_that_which_was_asked_for(shot_folder, tmp_path
     monkeypatch.setattr(job, "limit_threads", asked.append)
     monkeypatch.setattr(job, "validate_views", lambda *words, **more: validate(*words, **more) if asked else None)
     shot = open_shot(shot_folder)
-    assert len(list(hybrid.denoise_shot(shot, tmp_path / "out", preset="draft", threads=2))) == 3
+    assert len(list(ravg.denoise_shot(shot, tmp_path / "out", preset="draft", threads=2))) == 3
     assert asked == [2]
 
 

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
-import hybrid
 import ravg
+from hybrid.files.shots import open_shot
+from hybrid.run.job import denoise_shot
 
 ROOT = Path(__file__).parent.parent.parent
 PACKAGES = ["loops", "flow", "nlm", "network", "hybrid"]
@@ -38,10 +39,10 @@ def other(place: Path, name: str) -> Path:
     return place
 
 
-def test_ravg_exports_what_hybrid_does():
-    assert ravg.open_shot is hybrid.open_shot
-    assert ravg.denoise_shot is hybrid.denoise_shot
-    assert {*ravg.__all__} == {*hybrid.__all__, "__version__", "check_packages"}
+def test_ravg_exports_what_is_in_hybrid():
+    assert ravg.open_shot is open_shot
+    assert ravg.denoise_shot is denoise_shot
+    assert all(hasattr(ravg, name) for name in ravg.__all__)
     with pytest.raises(AttributeError, match="module 'ravg' has no attribute 'close_shot'"):
         ravg.close_shot  # noqa: B018
 

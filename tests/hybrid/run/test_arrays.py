@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-import hybrid
+import ravg
 from hybrid.files.shots import open_shot
 from hybrid.run import arrays
 from hybrid.run.job import validate_views
@@ -35,9 +35,9 @@ def test_they_are_the_frames_of_files(shot, tmp_path, options):
     convention = shot.read(shot.numbers[0]).motion_convention
     assert (convention.direction, convention.unit) == ("cycles", "pixels")
     motion = f"cycles,pixels,y-{convention.y},scale={convention.scale}"
-    made = {result.number: result for result in hybrid.denoise_arrays(layers_of(shot), motion=motion, **options)}
+    made = {result.number: result for result in ravg.denoise_arrays(layers_of(shot), motion=motion, **options)}
     assert [*made] == [*shot.numbers]
-    files = {f.number: f for f in hybrid.denoise_shot(shot, tmp_path / "out", **options)}
+    files = {f.number: f for f in ravg.denoise_shot(shot, tmp_path / "out", **options)}
     denoised = open_shot(tmp_path / "out")
     for number, result in made.items():
         np.testing.assert_array_equal(result.layers["color"], denoised.read(number).color)
@@ -58,7 +58,7 @@ def test_a_share_of_the_noise_stays_in_all_layers(strength):
     frames[1]["color"] = frames[1]["color"].copy()
     frames[1]["color"][5, 6] = np.nan
     whole, part = (
-        next(hybrid.denoise_arrays(frames, first_pass="nlm", preset="fast", numbers=[1], strength=share)).layers
+        next(ravg.denoise_arrays(frames, first_pass="nlm", preset="fast", numbers=[1], strength=share)).layers
         for share in (1, strength)
     )
     for name in ("color", "diffuse", "glossy", "alpha"):
@@ -69,8 +69,8 @@ def test_a_share_of_the_noise_stays_in_all_layers(strength):
 
 def test_only_the_numbers_that_are_asked_for_are_denoised(shot):
     frames = [{"color": layers["color"]} for layers in layers_of(shot).values()]
-    whole = {result.number: result.layers["color"] for result in hybrid.denoise_arrays(frames, preset="draft")}
-    (middle,) = hybrid.denoise_arrays(frames, preset="draft", numbers=[2])
+    whole = {result.number: result.layers["color"] for result in ravg.denoise_arrays(frames, preset="draft")}
+    (middle,) = ravg.denoise_arrays(frames, preset="draft", numbers=[2])
     np.testing.assert_array_equal(middle.layers["color"], whole[2])
     assert [*whole] == [0, 1, 2, 3, 4]
 
@@ -83,7 +83,7 @@ def test_frames_are_looked_up_as_they_are_needed_and_work_ends_where_asked(shot)
 
     looked_up = []
     frames = Lazy({n: {"color": np.ones((16, 16, 3), np.float32)} for n in range(50)})
-    ended = list(hybrid.denoise_arrays(frames, preset="draft", progress=lambda result: result.number < 1))
+    ended = list(ravg.denoise_arrays(frames, preset="draft", progress=lambda result: result.number < 1))
     assert [result.number for result in ended] == [0, 1]
     assert max(looked_up) < 10
 
@@ -95,7 +95,7 @@ def test_a_network_takes_a_first_pass_and_aovs_from_memory(shot):
         {**layers, "estimate": layers["color"], "glow": layers["color"]}
         for layers in ({"color": frame["color"]} for frame in layers_of(shot).values())
     ]
-    results = [next(hybrid.denoise_arrays(frames, first_pass=source)) for source in ("auto", "nlm")]
+    results = [next(ravg.denoise_arrays(frames, first_pass=source)) for source in ("auto", "nlm")]
     assert not np.array_equal(results[0].layers["color"], results[1].layers["color"])
     assert results[0].layers["glow"].shape == (40, 56, 3)
 
@@ -145,7 +145,7 @@ def test_a_network_takes_a_first_pass_and_aovs_from_memory(shot):
 )
 def test_what_cannot_be_done_is_refused_at_once(frames, options, words):
     with pytest.raises(ValueError, match=words):
-        hybrid.denoise_arrays(frames, **({"method": "classical"} | options))
+        ravg.denoise_arrays(frames, **({"method": "classical"} | options))
 
 
 @pytest.mark.neural
@@ -157,7 +157,7 @@ def test_light_passes_add_up_to_the_color_as_those_of_files():
         parts = {name: rng.gamma(4, 0.25, (24, 32, 3)).astype(np.float32) for name in ("diffuse", "specular")}
         mask = np.ones((24, 32), np.float32)
         frames.append({"color": parts["diffuse"] + parts["specular"], **parts, "mask": mask})
-    for result in hybrid.denoise_arrays(frames, preset="fast", first_pass="bundled"):
+    for result in ravg.denoise_arrays(frames, preset="fast", first_pass="bundled"):
         layers = result.layers
         np.testing.assert_allclose(layers["diffuse"] + layers["specular"], layers["color"], rtol=1e-4, atol=1e-5)
         np.testing.assert_array_equal(layers["mask"], frames[0]["mask"][..., None])  # without noise: not denoised
@@ -182,7 +182,7 @@ def moving(vector):
 def test_vectors_along_which_frames_do_not_match_are_reported_once(vector, words):
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
-        assert len(list(hybrid.denoise_arrays(moving(vector), motion="next,pixels,y-down", preset="draft"))) == 3
+        assert len(list(ravg.denoise_arrays(moving(vector), motion="next,pixels,y-down", preset="draft"))) == 3
     assert len(found) == (words is not None)
     assert all(words in str(warning.message) and warning.filename == __file__ for warning in found)
 
@@ -192,14 +192,14 @@ def test_a_frame_without_a_finite_pixel_is_reported():
     frames[4]["color"][3:] = np.nan
     frames[5]["color"][:] = np.nan
     with pytest.warns(UserWarning, match="frame 5: no pixel of color is finite") as found:
-        list(hybrid.denoise_arrays(frames, preset="draft"))
+        list(ravg.denoise_arrays(frames, preset="draft"))
     assert len(found) == 1
 
 
 def test_frames_of_another_size_are_refused():
     frames = [{"color": np.ones((8, 8, 3))}, {"color": np.ones((8, 9, 3))}]
     with pytest.raises(ValueError, match=r"frame 1 has shape \(8, 9\), expected \(8, 8\)"):
-        list(hybrid.denoise_arrays(frames, preset="draft"))
+        list(ravg.denoise_arrays(frames, preset="draft"))
 
 
 @pytest.mark.neural

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import hybrid
+import ravg
 from hybrid.cli import main
 from hybrid.files.exr import read_exr
 from hybrid.run import job
@@ -31,8 +31,8 @@ def same(made, expected):
 
 @pytest.mark.parametrize(("preset", "estimate"), [("draft", None), ("draft", "nlm")])
 def test_without_a_network_it_is_the_command(shot_folder, tmp_path, preset, estimate):
-    shot = hybrid.open_shot(shot_folder)
-    made = list(hybrid.denoise_shot(shot, tmp_path / "made", preset=preset, first_pass=estimate or ""))
+    shot = ravg.open_shot(shot_folder)
+    made = list(ravg.denoise_shot(shot, tmp_path / "made", preset=preset, first_pass=estimate or ""))
     assert [frame.number for frame in made] == [1001, 1002, 1003]
     words = ["denoise", str(shot_folder), "-o", str(tmp_path / "out"), "--preset", preset]
     assert main([*words, *(["--first-pass", estimate] if estimate else [])]) == 0
@@ -40,8 +40,8 @@ def test_without_a_network_it_is_the_command(shot_folder, tmp_path, preset, esti
 
 
 def resumed(folder, out, **options):
-    shot = hybrid.open_shot(folder, aovs=options.pop("aovs", ()))
-    return [frame.resumed for frame in hybrid.denoise_shot(shot, out, resume=True, **options)]
+    shot = ravg.open_shot(folder, aovs=options.pop("aovs", ()))
+    return [frame.resumed for frame in ravg.denoise_shot(shot, out, resume=True, **options)]
 
 
 @pytest.mark.parametrize("changed", [{"no_stages": ["gate"]}, {"stages": ["warp"]}, {"first_pass": "nlm"}])
@@ -83,7 +83,7 @@ def test_the_example_runs(tmp_path, monkeypatch):
 
 def states(folder, **options):
     """Whether each frame was there, by `denoise_shot` with resume."""
-    return [frame.resumed for frame in hybrid.denoise_shot(hybrid.open_shot(folder), resume=True, **options)]
+    return [frame.resumed for frame in ravg.denoise_shot(ravg.open_shot(folder), resume=True, **options)]
 
 
 def command(folder, out, *words):
@@ -125,8 +125,8 @@ def test_progress_counts_the_frames_of_all_passes(shot_folder, tmp_path, passes)
         pytest.importorskip("torch")
         options = {"first_pass": "nlm", "passes": passes}
     steps = []
-    shot = hybrid.open_shot(shot_folder)
-    assert len(list(hybrid.denoise_shot(shot, tmp_path / "out", progress=steps.append, **options))) == 3
+    shot = ravg.open_shot(shot_folder)
+    assert len(list(ravg.denoise_shot(shot, tmp_path / "out", progress=steps.append, **options))) == 3
     assert [(step.run, step.done, step.total) for step in steps] == [
         (1 + index // 3, index + 1, 3 * passes) for index in range(3 * passes)
     ]
@@ -134,10 +134,10 @@ def test_progress_counts_the_frames_of_all_passes(shot_folder, tmp_path, passes)
 
 
 def test_a_callback_or_closing_ends_the_work_after_a_frame(tmp_path):
-    shot = hybrid.open_shot(Scene(frames=9).write(tmp_path / "in"))
-    ended = hybrid.denoise_shot(shot, tmp_path / "a", preset="draft", progress=lambda step: step.done < 2)
+    shot = ravg.open_shot(Scene(frames=9).write(tmp_path / "in"))
+    ended = ravg.denoise_shot(shot, tmp_path / "a", preset="draft", progress=lambda step: step.done < 2)
     assert [frame.number for frame in ended] == [1001, 1002]
-    closed = hybrid.denoise_shot(shot, tmp_path / "b", preset="draft")
+    closed = ravg.denoise_shot(shot, tmp_path / "b", preset="draft")
     next(closed)
     closed.close()
     for out in (tmp_path / "a", tmp_path / "b"):
@@ -190,14 +190,14 @@ def test_text_stands_for_paths_and_lists_for_tuples():
 
 
 def test_what_is_no_shot_no_output_or_no_options_is_refused(shot_folder, tmp_path):
-    shot = hybrid.open_shot(shot_folder)
+    shot = ravg.open_shot(shot_folder)
     for arguments, words in (
-        (("shot.####.exr", tmp_path), "shot is 'shot.####.exr', expected a Shot from hybrid.open_shot"),
+        (("shot.####.exr", tmp_path), "shot is 'shot.####.exr', expected a Shot from ravg.open_shot"),
         ((shot, None), "output is None, expected a pattern"),
         ((shot, tmp_path, "draft"), "options is 'draft', expected DenoiseOptions"),
     ):
         with pytest.raises(ValueError, match=words):
-            hybrid.denoise_shot(*arguments)
+            ravg.denoise_shot(*arguments)
 
 
 def test_presets_and_methods_belong_together():
@@ -214,10 +214,10 @@ def test_threads_and_the_allocator_are_those_that_were_asked_for(shot_folder, tm
 
     def run(**options):
         if in_memory:
-            list(hybrid.denoise_arrays([{"color": np.ones((16, 16, 3))}], preset="draft", **options))
+            list(ravg.denoise_arrays([{"color": np.ones((16, 16, 3))}], preset="draft", **options))
         else:
-            shot = hybrid.open_shot(shot_folder, frames="1002")
-            list(hybrid.denoise_shot(shot, tmp_path / "out", preset="draft", **options))
+            shot = ravg.open_shot(shot_folder, frames="1002")
+            list(ravg.denoise_shot(shot, tmp_path / "out", preset="draft", **options))
 
     run()
     assert called == ["reuse"]
