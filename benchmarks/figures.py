@@ -36,11 +36,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import ladder
 from bench_shot import measure, write_shot
 
-from hybrid import open_shot
 from hybrid.files.exr import read_exr
 from hybrid.files.frame import Array
 from hybrid.files.movies import write_movie
 from hybrid.files.png import encode_bytes, write_png
+from ravg import open_shot
 from tests.exr_files import write_layers
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -23,12 +23,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from hybrid import denoise_shot, open_shot
 from hybrid.comparison.evaluation import motion_between
 from hybrid.comparison.metrics import psnr, temporal_psnr
 from hybrid.denoising.oidn import denoise_oidn
 from hybrid.files.frame import Array
 from hybrid.files.shots import Shot
+from ravg import denoise_shot, open_shot
 
 OIDN = {"oidn-high": None, "oidn-best": "high"}
 # Networks and averages from noisy frames alone, by the options of `denoise_shot`.
