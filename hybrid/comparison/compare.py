@@ -20,7 +20,7 @@ from hybrid.files.frame import Frames
 from hybrid.files.sources import versions
 from hybrid.runtime.system import load_average, processor_name
 
-VERSIONS = ("numpy", "numba", "opencv-contrib-python-headless", "scikit-image", "torch", "pyoidn")
+VERSIONS = ("numpy", "numba", "opencv-contrib-python-headless", "torch", "pyoidn")
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ MADE_FROM = "ravg/made-from"
 HASHED = 2**20
 _BLOCKS = 16
 # Packages that all pixels depend on.
-PACKAGES = ("ravg", "numpy", "numba", "opencv-contrib-python-headless", "scikit-image")
+PACKAGES = ("ravg", "numpy", "numba", "opencv-contrib-python-headless")
 
 
 @dataclass(frozen=True)
