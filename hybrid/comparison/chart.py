@@ -186,15 +186,15 @@ def _draw_labels(figure: Figure, axes: Axes, points: Sequence[_Point], metric: M
         text.set(weight=weight, color=color, parse_math=False, gid=f"name-{p.index}")
         # The front's line leads to a point from below and from it to the right, so labels above cross it least.
         sides = [(dx, dy) for dy in ((1, 0, -1) if p.on_front else (0, -1, 1)) for dx in (-1, 0, 1) if dx or dy]
-        for points_off, (dx, dy) in product(range(7, 240, 9), sides):
-            text.set(position=(points_off * dx, points_off * dy))
+        for distance, (dx, dy) in product(range(7, 240, 9), sides):  # in points
+            text.set(position=(distance * dx, distance * dy))
             text.set(horizontalalignment={-1: "right", 0: "center", 1: "left"}[dx])
             text.set(verticalalignment={-1: "top", 0: "center", 1: "bottom"}[dy])
             box = text.get_window_extent()
             if np.array_equal(Bbox.union([box, frame]).extents, frame.extents) and not box.count_overlaps(taken):
                 break
         taken.append(box)
-        if points_off > 7:
+        if distance > 7:
             start = axes.transData.transform((p.x, p.y))
             end = axes.transData.inverted().transform(start + np.multiply(text.get_position(), figure.dpi / 72))
             line = Line2D([p.x, end[0]], [p.y, end[1]], color=color, linewidth=0.5, zorder=1, clip_on=False)
