@@ -9,6 +9,7 @@ from hybrid.denoising.plan import Rules
 from hybrid.denoising.stabilize import Denoised
 from hybrid.files.shots import Shot, open_shot
 from hybrid.run import pipeline
+from hybrid.run.memory import MemoryPlan
 from hybrid.run.pipeline import Finished
 from hybrid.runtime.timing import Timings
 from tests.scenes import Scene, denoise_view
@@ -70,7 +71,7 @@ def test_without_it_a_frame_is_there_before_the_next_one_is_begun(tmp_path, shot
         begun.append(aligned.number)
         return picture(aligned)
 
-    for frame in denoise_view(shot, tmp_path / "out", make, ALONE, radius=1, background=False):
+    for frame in denoise_view(shot, tmp_path / "out", make, ALONE, radius=1, memory=MemoryPlan(background=False)):
         assert frame.path.is_file()
         assert begun[-1] == frame.number
         # Its window, and perhaps one beyond for what shines in a frame alone.
@@ -164,7 +165,7 @@ def test_whoever_stops_listening_finds_whole_frames(tmp_path, shot):
 
 def test_it_makes_no_difference_to_the_pictures(tmp_path, shot):
     for name, beside in (("one", True), ("other", False)):
-        list(denoise_view(shot, tmp_path / name, picture, ALONE, background=beside))
+        list(denoise_view(shot, tmp_path / name, picture, ALONE, memory=MemoryPlan(background=beside)))
     for path in sorted((tmp_path / "one").iterdir()):
         assert path.read_bytes() == (tmp_path / "other" / path.name).read_bytes()
     wider = replace(SCENE, frames=6).write(tmp_path / "wider")
