@@ -1,7 +1,5 @@
 """Fixtures of the tests of the extension: Blender with it installed, a small scene, and its frames."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Blender as a process of its own, for the tests of the extension: how a script is run, and what scripts begin with."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """The extension's side of the process that it starts; needs no Blender."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import stat

@@ -4,8 +4,6 @@ Skipped where bpy is not installed; what runs `ravg`, which lives in another env
 the environment variable RAVG_COMMAND.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Which rendered frames are noisy renders, read from their headers; needs no Blender."""
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 

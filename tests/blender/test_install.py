@@ -1,7 +1,5 @@
 """How ravg is installed for Blender, without installing it; needs no Blender."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """From denoised frames to the movie: what an artist does next, and what Blender then writes."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

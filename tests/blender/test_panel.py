@@ -1,7 +1,5 @@
 """The panel and the dialogs, drawn by Blender without a window into a layout that records them."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import sys
@@ -36,15 +34,7 @@ def test_the_panel_of_a_job_shows_how_far_it_is_and_a_way_to_stop_it(blender, st
     begin = "from bl_ext.user_default.ravg import scenes; jobs.begin(scene); scenes.override(scene, replace=True)"
     code = f"{DRAWN}{begin}; answer = draw()"
     drawn = blender.run(code, blend=rendered, command=stub)
-    assert drawn == [
-        "Preset",
-        "Light Passes",
-        "Strength",
-        "Noisy Frames",
-        "Denoised Frames",
-        "Rendering: 0 of 0 frames",
-        "Stop",
-    ]
+    assert drawn == [*SETTINGS, "Rendering: 0 of 0 frames", "Stop"]
 
 
 def test_the_panel_of_a_job_looks_at_no_frame(blender, shot, tmp_path):

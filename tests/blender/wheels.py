@@ -1,7 +1,5 @@
 """Wheels that hold next to nothing, for the tests of installing."""
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 

@@ -8,8 +8,6 @@ differ in size, and so cannot be confused. Written beside this script: `translat
 luminance of the three frames and the Vector pass of the middle one.
 """
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 

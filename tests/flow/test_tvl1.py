@@ -139,9 +139,7 @@ def test_noise_alone_does_not_move_vectors() -> None:
 
 
 @pytest.mark.parametrize("threads", [2, 5, 16])
-def test_the_flow_does_not_depend_on_the_number_of_threads(
-    shot: Shot, threads: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_flow_does_not_depend_on_the_number_of_threads(shot, threads, monkeypatch):
     start = shot.flow + perturbation(np.random.default_rng(1), 2)
     flows = []
     for count in (1, threads):

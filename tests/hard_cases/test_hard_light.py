@@ -10,18 +10,7 @@ from hybrid.comparison.metrics import psnr
 from hybrid.denoising.first_pass import Classical
 from hybrid.denoising.pseudo_reference import CLASSICAL_PRESETS, STANDARD
 from hybrid.run.arrays import denoise_arrays
-from tests.hard_cases.hard import (
-    MIDDLE,
-    REACH,
-    align,
-    constant,
-    denoise,
-    frame,
-    shot,
-    spoil,
-    truth,
-    within_range,
-)
+from tests.hard_cases.hard import MIDDLE, REACH, align, constant, denoise, frame, shot, spoil, truth, within_range
 from tests.scenes import Scene
 from tests.seldom import seldom
 

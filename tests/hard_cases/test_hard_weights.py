@@ -14,13 +14,7 @@ torch = pytest.importorskip("torch")
 from safetensors.torch import save_file  # noqa: E402
 
 from hybrid.cli import main  # noqa: E402
-from network.checkpoint import (  # noqa: E402
-    VERSION,
-    describe,
-    load_model,
-    save_model,
-    shipped_weights,
-)
+from network.checkpoint import VERSION, describe, load_model, save_model, shipped_weights  # noqa: E402
 from network.presets import build_preset  # noqa: E402
 
 pytestmark = pytest.mark.neural
@@ -86,8 +80,8 @@ def test_pickles_are_not_opened(tmp_path):
 @pytest.mark.parametrize(
     ("metadata", "word"),
     [
-        ({"format": None}, "format"),
-        ({"format": "somebody-elses"}, "format"),
+        ({"format": None}, "expected format 'ravg-network', got None"),
+        ({"format": "somebody-elses"}, "expected format 'ravg-network', got 'somebody-elses'"),
         ({"version": "1"}, f"version {VERSION}, got 1"),
         ({"version": "one"}, "version"),
         ({"description": None}, "description"),

@@ -78,19 +78,8 @@ def test_options_have_one_name_and_one_group_everywhere(command, capsys):
 
 
 # Options of which each command says more: its output, which networks, what is random, how many of what.
-SAID_BY_EACH = {
-    "--output",
-    "--preset",
-    "--seed",
-    "--threads",
-    "--tile",
-    "--levels",
-    "--reference",
-    "--resume",
-    "--beside",
-    "--frames",
-    "--window",
-}
+SAID_BY_EACH = {"--output", "--preset", "--seed", "--threads", "--tile", "--levels", "--reference", "--resume"}
+SAID_BY_EACH |= {"--beside", "--frames", "--window"}
 
 
 def test_an_option_of_one_name_says_the_same_in_every_command():
@@ -203,17 +192,8 @@ def test_denoise_writes_denoised_frames_that_keep_everything_else(tmp_path, caps
     scene = Scene()
     folder, out = scene.write(tmp_path / "in"), tmp_path / "out"
     preview = tmp_path / "look.png"
-    code, _, err = run(
-        capsys,
-        "denoise",
-        folder / "shot.####.exr",
-        "-o",
-        out / "done.####.exr",
-        "--preset",
-        "draft",
-        "--preview",
-        preview,
-    )
+    words = ["denoise", folder / "shot.####.exr", "-o", out / "done.####.exr", "--preset", "draft"]
+    code, _, err = run(capsys, *words, "--preview", preview)
     assert code == 0, err
     assert preview.stat().st_size > 1000
     for index in range(3):

@@ -12,7 +12,6 @@ import pytest
 
 import ravg
 from hybrid.alignment.align import align
-from hybrid.alignment.measure import measure_frame as measure
 from hybrid.cli import main
 from hybrid.commands.shots import ShotInput
 from hybrid.comparison.results import Comparison
@@ -242,21 +241,6 @@ def test_a_report_has_the_options_of_compare(shot_folder, tmp_path, monkeypatch)
 def test_a_frame_that_is_not_to_be_demodulated_is_not(shot_folder):
     frame = FrameStream(open_shot(shot_folder), Rules(off=frozenset({"demodulate"}))).frame(1002)
     np.testing.assert_array_equal(frame.irradiance, frame.radiance)
-
-
-def test_measurements_of_frames_that_have_passed_are_dropped(shot_folder, monkeypatch):
-    measured = []
-
-    def measure_frame(frame, small):
-        measured.append(frame.number)
-        return measure(frame, small)
-
-    monkeypatch.setattr("hybrid.denoising.stream.measure_frame", measure_frame)
-    stream = FrameStream(open_shot(shot_folder), Rules())
-    stream.measurements([1001, 1002])
-    stream.keep([1002, 1003])
-    stream.measurements([1001, 1002])
-    assert measured == [1001, 1002, 1001]
 
 
 def test_the_header_has_the_stages_of_the_first_view_and_the_neighbours_of_all(tmp_path, monkeypatch):

@@ -55,16 +55,8 @@ def count(monkeypatch):
     def watch(owner, name):
         monkeypatch.setattr(owner, name, counted(name, getattr(owner, name)))
 
-    for name in (
-        "prepare",
-        "remove_fireflies",
-        "shrink",
-        "measure_frame",
-        "measure_pair",
-        "measure_flows",
-        "fixed_noise",
-        "noise_correlation",
-    ):
+    measured = ("measure_frame", "measure_pair", "measure_flows", "fixed_noise", "noise_correlation")
+    for name in ("prepare", "remove_fireflies", "shrink", *measured):
         watch(stream, name)
     for name in ("align", "align_results", "find_bright", "restore_mean", "blend_samples"):
         watch(stabilize, name)

@@ -109,9 +109,7 @@ def bare(truth: Truth, eye: str = "", *, other: bool = False) -> Channels:
 
 
 @pytest.mark.parametrize("default", ["", "left"], ids=["multiView", "left and right"])
-def test_both_eyes_of_bare_channels_are_those_of_mono_files(
-    default: str, mono: dict[str, bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_both_eyes_of_bare_channels_are_those_of_mono_files(default, mono, tmp_path, capsys):
     """The left one was denoised twice and the right one never, or only the left one was denoised."""
     header = {} if default else {"multiView": ["left", "right"]}
     for truth in FRAMES:
@@ -127,9 +125,7 @@ def test_both_eyes_of_bare_channels_are_those_of_mono_files(
     assert color(right, "right") == mono["right"]
 
 
-def test_every_view_layer_is_denoised_or_the_one_that_was_chosen(
-    mono: dict[str, bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_view_layer_is_denoised_or_the_one_that_was_chosen(mono, tmp_path, capsys):
     for truth in FRAMES:
         channels = {n.replace("ViewLayer.", "Front."): p for n, p in view(truth).items()}
         channels |= {n.replace("ViewLayer.", "Back."): p for n, p in view(truth, other=True).items()}
@@ -254,9 +250,7 @@ def test_two_eyes_do_not_go_into_one_file(tmp_path: Path, capsys: pytest.Capture
         ("--output", "out_%v"),
     ],
 )
-def test_two_eyes_share_nothing(
-    option: str, value: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_eyes_share_nothing(option, value, tmp_path, monkeypatch, capsys):
     """One eye's picture was written over the other's, or made from its estimates, with exit code 0."""
     monkeypatch.chdir(tmp_path)
     for eye in ("left", "local"):

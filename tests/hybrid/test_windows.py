@@ -13,7 +13,6 @@ from hybrid.denoising.plan import DENOISED, NOISY, STAGES, Rules
 from hybrid.denoising.pseudo_reference import STANDARD, filter_window, gated_average
 from hybrid.denoising.stabilize import Denoised
 from hybrid.denoising.stream import FrameStream, plan_shot
-from hybrid.files import reader as reader_module
 from hybrid.files.exr import read_exr
 from hybrid.files.shots import open_shot
 from hybrid.run.records import read_records
@@ -113,22 +112,6 @@ def test_a_frame_is_the_same_whatever_part_of_the_shot_is_asked_for(tmp_path, ch
         assert one.parts[0].header["ravg/stages"] == other.parts[0].header["ravg/stages"]
         for name in one.channel_names:
             np.testing.assert_array_equal(one.channel(name), other.channel(name), err_msg=f"{path.name} {name}")
-
-
-def test_a_file_is_read_once_for_the_plan_and_the_work_and_once_to_be_written_over(tmp_path, monkeypatch):
-    shot, read = open_shot(replace(CALM, frames=8).write(tmp_path / "in", edit=burnt)), []
-    whole = reader_module.read_exr
-
-    def counted(path, *, pixels=True, **options):
-        if pixels:
-            read.append(path.name)
-        return whole(path, pixels=pixels, **options)
-
-    monkeypatch.setattr(reader_module, "read_exr", counted)
-    for _ in denoise_view(shot, tmp_path / "out", lambda w: Denoised(filter_window(w, STANDARD)), Rules()):
-        pass
-    assert len(read) == 16
-    assert {read.count(name) for name in read} == {2}
 
 
 @pytest.mark.parametrize("step", [(0, 0), (2, 1)])

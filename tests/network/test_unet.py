@@ -132,9 +132,7 @@ def test_black_stays_finite(made_up: OidnUNet) -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_fused_convolutions_give_the_same(
-    made_up: OidnUNet, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fused_convolutions_give_the_same(made_up, dtype, monkeypatch):
     if dtype not in convolution._FUSED:
         pytest.skip(f"torch without oneDNN, or a processor without {dtype}")
     picture = torch.rand(1, made_up.config.inputs, 48, 64, generator=torch.Generator().manual_seed(1))

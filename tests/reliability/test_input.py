@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import socket
 import subprocess
 import sys
@@ -78,16 +77,6 @@ def test_an_aov_that_is_a_role_changes_nothing_else(folder, name):
         same(folder / "plain", folder / "out")
 
 
-@cases((["color", "beauty"], ["color", "beauty", "rgba"]), "extra")
-def test_layers_that_could_be_one_thing_are_refused(folder, extra):
-    def edit(index: int, layers: Layers) -> None:
-        layers |= {name: layers[COLOR].copy() for name in extra}
-        del layers[COLOR]
-
-    shot(folder / "in", 3, edit)
-    ravg(*draft(), folder=folder).is_refused()
-
-
 # --- 12: no crash, no hang: one line
 
 
@@ -132,54 +121,6 @@ def test_loops_of_links_and_numbers_without_end_are_refused(folder, words):
 def test_little_memory_ends_in_one_line(folder, mebibytes):
     shot(folder / "in", 3, size=(1500, 2000), noise=0)
     ravg(*draft(), folder=folder, memory=mebibytes * 2**20).is_refused()
-
-
-@cases(("[red]x[/blue]", "[/]", "[link=http://a]b", "\x1b[2J", "[bold]"), "name")
-def test_a_name_is_shown_as_it_is(folder, name):
-    shot(folder / "in", 2)
-    shot(folder / "clean", 2, noise=0)
-    words = ["compare", "in", "--reference", "clean", "--methods", "draft", "--rounds", "1"]
-    done = ravg(*words, "--external", f"{name}=clean", folder=folder).ends("either")
-    assert done.code or "".join(name.split())[:12] in "".join(done.said.split())
-
-
-RESULTS = (
-    "", "null", "[]", "{}", "[" * 10**5, '{"results": 1}', '{"shot": 1, "results": [{}], "facts": {}}',
-    '{"shot": "x", "results": [{"metrics": []}], "facts": {}}', '{"shot": "x", "results": "abc", "facts": {}}',
-    '{"shot": "x", "results": [null], "facts": null}', "\\ud800", '{"results": [{"metrics": {"psnr": 0}}]}',
-)  # fmt: skip
-
-
-@cases(RESULTS, "text")
-def test_results_that_are_none_are_refused(folder, text):
-    (folder / "report").mkdir()
-    (folder / "report" / "results.json").write_text(text)
-    ravg("compare", "--with-report", "report", "-o", "page", folder=folder, seconds=60).is_refused()
-
-
-WITHOUT_LIBRARY = """
-import sys, types
-broken = types.ModuleType("pyoidn")
-broken.__spec__ = __import__("importlib.machinery").machinery.ModuleSpec("pyoidn", None)
-def absent(name):
-    if name.startswith("__"):
-        raise AttributeError(name)
-    raise OSError("libOpenImageDenoise.so.2: cannot open shared object file")
-broken.__getattr__ = absent
-sys.modules["pyoidn"] = broken
-from hybrid.cli import main
-sys.exit(main(sys.argv[1:]))
-"""
-
-
-@pytest.mark.neural
-@cases(("auto", "oidn", "oidn-best"), "estimate")
-def test_pyoidn_without_its_library(folder, estimate):
-    """auto does without, and says so."""
-    shot(folder / "in", 2)
-    words = ["denoise", "in", "-o", "out", "--first-pass", estimate]
-    done = run_python("-c", WITHOUT_LIBRARY, *words, folder=folder).ends("works" if estimate == "auto" else "refused")
-    assert estimate != "auto" or re.search(r"First pass  (nlm|bundled)\b", done.said)
 
 
 # --- 13: words of any encoding, folders of any name

@@ -223,9 +223,7 @@ def test_next_to_no_noise_costs_no_frame_a_decibel(tmp_path: Path, name: str, pr
 
 @pytest.mark.parametrize("tint", [(1, 1, 1), (1, 0.6, 0.3)])
 @pytest.mark.parametrize("share", [lambda i: 0.3, lambda i: 0.3 * (i % 2), lambda i: 2.0 * (i == 2)])
-def test_parts_add_up_whatever_their_light_does(
-    tmp_path: Path, share: Callable[[int], float], tint: tuple[float, ...]
-) -> None:
+def test_parts_add_up_whatever_their_light_does(tmp_path, share, tint):
     """A gray or tinted gloss that stands, blinks or flashes beside a textured diffuse light."""
 
     def split(index: int, layers: Layers) -> None:

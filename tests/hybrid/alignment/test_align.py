@@ -1,7 +1,5 @@
 """Windows as they are aligned: estimates, parts of a frame, frames that are missing."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

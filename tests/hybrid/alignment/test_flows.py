@@ -1,7 +1,5 @@
 """Where the pixels of one frame are in another: the renderer's vectors, and what corrects them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

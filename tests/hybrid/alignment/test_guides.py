@@ -1,7 +1,5 @@
 """Guides of a window, averaged where it moves by whole pixels."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from hybrid.alignment.align import align

@@ -1,7 +1,5 @@
 """Frames that repeat another, by their noise."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

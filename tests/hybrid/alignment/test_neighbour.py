@@ -1,7 +1,5 @@
 """The confidence in the pixels of a neighbour, by its motion and by its light."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from hybrid.alignment.neighbour import AGREEING, combine_confidence, novelty_of

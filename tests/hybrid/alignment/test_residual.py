@@ -1,7 +1,5 @@
 """Noise of a neighbour at the pixels of the centre."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Suns beyond half, negative light of wide gamuts and gray pictures come out as they were rendered."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A window of aligned frames: the centre in the place of missing ones, guides of all frames."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -26,6 +26,7 @@ pytestmark = pytest.mark.cluster
 ROOT = Path(__file__).parents[3]
 FRAMES = 6
 OPTIONS = ["--preset", "draft"]
+NOBODY = "tcp://127.0.0.1:9"
 
 
 @pytest.fixture(scope="module")
@@ -197,20 +198,12 @@ def test_ctrl_c_keeps_what_is_finished_and_stops_the_workers(cluster, shot, tmp_
 
 def test_what_cannot_be_written_is_refused_before_anything_is_handed_out(shot, tmp_path, capsys):
     """A preview was looked at when all frames were there."""
-    words = [
-        "denoise",
-        "--method=classical",
-        str(shot),
-        "-o",
-        str(tmp_path / "out"),
-        "--scheduler",
-        "tcp://127.0.0.1:9",
-    ]
+    words = ["denoise", "--method=classical", str(shot), "-o", str(tmp_path / "out"), "--scheduler", NOBODY]
     assert main([*words, "--preview", str(tmp_path / "x.tif")]) == 2
     assert "expected a name that ends in .png" in words_in(capsys.readouterr().err)
     assert main([*words, "--contact-sheet", str(tmp_path / "x.png"), "--preview", str(tmp_path / "x.png")]) == 1
     assert "would overwrite preview" in capsys.readouterr().err
-    assert main(["denoise", "--method=classical", str(shot), "-o", str(shot), "--scheduler", "tcp://127.0.0.1:9"]) == 1
+    assert main([*words, "-o", str(shot)]) == 1
     assert "would overwrite an input" in capsys.readouterr().err
 
 
@@ -229,14 +222,6 @@ def test_the_preview_of_several_pictures_is_that_of_the_first(cluster, tmp_path)
 
 def test_no_scheduler_is_one_line(shot, tmp_path, capsys):
     pytest.importorskip("distributed")
-    words = [
-        "denoise",
-        "--method=classical",
-        str(shot),
-        "-o",
-        str(tmp_path / "out"),
-        "--scheduler",
-        "tcp://127.0.0.1:9",
-    ]
+    words = ["denoise", "--method=classical", str(shot), "-o", str(tmp_path / "out"), "--scheduler", NOBODY]
     assert main(words) == 1
-    assert capsys.readouterr().err.splitlines()[-1].startswith("error: no Dask scheduler answers at tcp://127.0.0.1:9")
+    assert capsys.readouterr().err.splitlines()[-1].startswith(f"error: no Dask scheduler answers at {NOBODY}")

@@ -1,7 +1,5 @@
 """`ravg blender-extension`: the file that Blender installs."""
 
-from __future__ import annotations
-
 import tomllib
 import zipfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The commands `prepare` and `train`, and what `denoise` says of a network's work."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil
@@ -72,19 +70,8 @@ def test_what_makes_no_sense_at_one_level_is_left_out_of_the_clips(shot, tmp_pat
         layers = {layer.name: image.pixels(layer.channels) for layer in image.layers}
         layers["ViewLayer.Denoising Albedo"][:] = 0
         write_layers(path, layers)
-    options = (
-        kept,
-        "-o",
-        tmp_path / "clips",
-        "--levels",
-        "a=24,b=24",
-        "--tile",
-        0,
-        "--first-pass",
-        "nlm",
-        "--window",
-        3,
-    )
+    options = [kept, "-o", tmp_path / "clips", "--levels", "a=24,b=24", "--tile", 0]
+    options += ["--first-pass", "nlm", "--window", 3]
     assert run("make-clips", *options, "--strict") == 1
     assert not list((tmp_path / "clips").glob("*.safetensors"))
     assert run("make-clips", *options, "--motion", "none") == 0
@@ -225,9 +212,8 @@ def test_clips_are_prepared_and_trained_on(shot, tmp_path, capsys, monkeypatch):
 
     # On one's own footage, one level and no reference, from weights there are.
     own = tmp_path / "own"
-    assert (
-        run("make-clips", shot / "a.####.exr", "-o", own, "--tile", "32", "--window", "3", "--first-pass", "nlm") == 0
-    )
+    words = ["--tile", "32", "--window", "3", "--first-pass", "nlm"]
+    assert run("make-clips", shot / "a.####.exr", "-o", own, *words) == 0
     tuned = tmp_path / "tuned.safetensors"
     assert run("train", own, "-o", tuned, "--init", out, "--steps", "1", "--crop", "32", "--rate", "1e-4") == 0
     assert load_model(tuned).config == load_model(out).config
@@ -268,10 +254,7 @@ OPTIONS = {
     "workers": (["--workers", 2], 2),
     "seed": (["--seed", 5], 5),
     "validate_minutes": (["--validate-minutes", 3], 3.0),
-    "sampler": (
-        ["--crop", 64, "--sets", 4, "--pseudo", 0.25],
-        SamplerConfig(crop=64, sets=4, pseudo=0.25),
-    ),
+    "sampler": (["--crop", 64, "--sets", 4, "--pseudo", 0.25], SamplerConfig(crop=64, sets=4, pseudo=0.25)),
 }
 NOT_OFFERED = {"weight_decay"}
 

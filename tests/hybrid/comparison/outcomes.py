@@ -1,7 +1,5 @@
 """Made-up results of methods."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from hybrid.comparison.results import METRICS, Cost, MethodResult, summarize

@@ -1,7 +1,5 @@
 """Shots in memory, and methods for them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Animations hold the frames of every method in their order, small enough, and as movies in their own size."""
 
-from __future__ import annotations
-
 import base64
 from pathlib import Path
 

@@ -2,8 +2,6 @@
 
 # ruff: noqa: E402 - skipped by name without the extra `compare`
 
-from __future__ import annotations
-
 import math
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The comparison: each method judged, timed and weighed by itself, and none dropped in silence."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Pictures inside a page: nothing that can be seen is lost, and what does not fit is left out and said."""
 
-from __future__ import annotations
-
 import base64
 import zlib
 from typing import Any

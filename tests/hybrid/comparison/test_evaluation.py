@@ -1,7 +1,5 @@
 """Frames that methods have left: measured against the reference, in space and in time."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from threading import Barrier

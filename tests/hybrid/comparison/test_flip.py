@@ -1,7 +1,5 @@
 """HDR-FLIP against the authors' own code, and where that has nothing to say."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

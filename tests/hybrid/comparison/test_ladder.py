@@ -1,7 +1,5 @@
 """How many times its samples a rival needs: made-up curves whose answer is known."""
 
-from __future__ import annotations
-
 import pytest
 
 from hybrid.comparison.ladder import LEAST_ERROR, Factor, build_ladder, factors, join_ladders, samples_factor

@@ -1,7 +1,5 @@
 """The methods of a comparison give finite frames nearer to the truth."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -43,9 +41,7 @@ def test_every_method_gives_frames_nearer_to_the_truth(shot: Shot, name: str) ->
 
 
 @pytest.mark.parametrize(("names", "value"), [("Combined", 2), ("Image", 2), ("denoised", 2), ("other", 1)])
-def test_of_a_finished_sequence_the_denoised_layer_is_read(
-    shot: Shot, tmp_path: Path, names: str, value: float
-) -> None:
+def test_of_a_finished_sequence_the_denoised_layer_is_read(shot, tmp_path, names, value):
     """The Noisy Image of Blender's files, which ravg leaves in its own, was measured."""
     size = shot.shape
     noisy = "Noisy Image" if names != "denoised" else "color"

@@ -2,8 +2,6 @@
 
 # ruff: noqa: E402 - skipped by name without the extra `compare`
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

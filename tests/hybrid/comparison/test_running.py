@@ -1,7 +1,5 @@
 """Methods run apart: what they cost is their own, and none is dropped in silence."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from dataclasses import replace
@@ -21,10 +19,7 @@ from hybrid.files.frame import Frame
 from hybrid.runtime import timing
 from tests.hybrid.comparison.shots import NOISY, SIZE, Array, MemoryShot, make_shots, perfect, ways
 
-needs_oidn = [
-    pytest.mark.oidn,
-    pytest.mark.skipif(find_spec("pyoidn") is None, reason="pyoidn is not installed"),
-]
+needs_oidn = [pytest.mark.oidn, pytest.mark.skipif(find_spec("pyoidn") is None, reason="pyoidn is not installed")]
 
 
 # Methods, at module level: they run in another process.

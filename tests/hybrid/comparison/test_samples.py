@@ -1,7 +1,5 @@
 """The worth of a denoiser in samples: made-up errors whose answer is known."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frames on disk: read as they were kept, whatever they are called."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Results as text: numbers, and tables for a terminal and for Markdown."""
 
-from __future__ import annotations
-
 import io
 import math
 from dataclasses import replace

@@ -308,34 +308,20 @@ def test_where_nothing_is_kept_the_reason_says_so(tmp_path):
 def test_the_command_says_what_was_taken(tmp_path, capfd):
     folder = SCENE.write(tmp_path / "noisy", edit=denoised)
     out = tmp_path / "out"
-    assert main(["denoise", "--method=classical", str(folder), "-o", str(out), "--first-pass", "auto"]) == 0
+    words = ["denoise", "--method=classical", str(folder), "-o", str(out), "--first-pass"]
+    assert main([*words, "auto"]) == 0
     assert "First pass  file (the file holds a denoised picture)" in capfd.readouterr().err
     assert open_shot(out).numbers == open_shot(folder).numbers
     assert [record["first_pass"] for _, record in read_records(out)] == ["file"]
-    assert (
-        main(
-            [
-                "denoise",
-                "--method=classical",
-                str(folder),
-                "-o",
-                str(out),
-                "--first-pass",
-                str(tmp_path / "no.####.exr"),
-            ]
-        )
-        == 1
-    )
+    assert main([*words, str(tmp_path / "no.####.exr")]) == 1
 
 
 def test_a_shot_as_blenders_defaults_render_it_just_works(tmp_path, capfd):
     """Cycles with OIDN and its passes stored, adaptive sampling, one seed for all frames (examples/render_shot.py)."""
     folder = Path(__file__).parents[2] / "data" / "defaults"
     out = tmp_path / "stable.####.exr"
-    assert (
-        main(["denoise", "--method=classical", str(folder / "noisy.####.exr"), "-o", str(out), "--first-pass", "auto"])
-        == 0
-    )
+    words = ["denoise", "--method=classical", str(folder / "noisy.####.exr"), "-o", str(out)]
+    assert main([*words, "--first-pass", "auto"]) == 0
     said = capfd.readouterr().err
     assert "First pass  file" in said
     assert "warning: constant seed: " in said
@@ -355,20 +341,16 @@ def late(folder, by, step=(3, 1)):
     return scene
 
 
+def denoise_late(folder):
+    words = ["denoise", "--method=classical", str(folder / "in"), "-o", str(folder / "out"), "--frames", "1002-1007"]
+    return main([*words, "--first-pass", str(folder / "done")])
+
+
 @pytest.mark.parametrize(("by", "other"), [(1, "previous"), (-1, "next")])
 def test_pictures_of_the_neighbouring_frames_are_refused(tmp_path, capsys, by, other):
     """Each frame came out as the one beside it, with exit code 0."""
     late(tmp_path / "done", by).write(tmp_path / "in")
-    words = [
-        "denoise",
-        "--method=classical",
-        str(tmp_path / "in"),
-        "-o",
-        str(tmp_path / "out"),
-        "--frames",
-        "1002-1007",
-    ]
-    assert main([*words, "--first-pass", str(tmp_path / "done")]) == 1
+    assert denoise_late(tmp_path) == 1
     assert f"each picture belongs to the {other} frame" in capsys.readouterr().err
     assert not list((tmp_path / "out").glob("*.exr"))
 
@@ -376,16 +358,7 @@ def test_pictures_of_the_neighbouring_frames_are_refused(tmp_path, capsys, by, o
 @pytest.mark.parametrize(("by", "step"), [(0, (3, 1)), (1, (0, 0))])
 def test_pictures_that_are_alike_are_taken(tmp_path, by, step):
     late(tmp_path / "done", by, step).write(tmp_path / "in")
-    words = [
-        "denoise",
-        "--method=classical",
-        str(tmp_path / "in"),
-        "-o",
-        str(tmp_path / "out"),
-        "--frames",
-        "1002-1007",
-    ]
-    assert main([*words, "--first-pass", str(tmp_path / "done")]) == 0
+    assert denoise_late(tmp_path) == 0
 
 
 @pytest.mark.parametrize("spec", ["bundled", "oidn-fast", "oidn-clean"])

@@ -406,17 +406,6 @@ class TestInFiles:
         for n in range(MIDDLE - 3, MIDDLE + 4):  # the picture beside, its window, and one for what shines alone
             assert f"shot.{n}.exr" in header[MADE_FROM]
 
-    def test_each_picture_is_made_once(self, tmp_path):
-        begun = []
-
-        def make(aligned):
-            begun.append(aligned.number)
-            return nearly(MOVING)(aligned)
-
-        shot = open_shot(MOVING.write(tmp_path / "in"))
-        self.run(shot, tmp_path / "out", make)
-        assert begun == list(shot.numbers)
-
     def test_a_frame_beside_that_cannot_be_made_is_done_without_where_the_run_keeps_going(self, tmp_path):
         shot, broken = open_shot(MOVING.write(tmp_path / "in")), {MIDDLE + 1}
 

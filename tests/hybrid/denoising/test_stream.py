@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hybrid.denoising.first_pass import PerFrame, find_first_pass
-from hybrid.denoising.plan import Context, Rules
+from hybrid.denoising.plan import Rules
 from hybrid.denoising.stream import FrameStream, plan_shot
 from hybrid.files.shots import open_shot
 from tests.scenes import Scene, grained
@@ -175,16 +175,6 @@ def test_frames_with_their_fireflies_are_kept_for_the_next_alone(tmp_path, monke
 
 def spied(function, calls):
     return lambda self, number: calls.append(number) or function(self, number)
-
-
-def test_a_window_is_planned_once(tmp_path, monkeypatch):
-    decided, decide = [], Rules.decide
-    monkeypatch.setattr(Rules, "decide", lambda *arguments: decided.append(arguments[3]) or decide(*arguments))
-    stream = FrameStream(open_shot(CALM.write(tmp_path)), Rules())
-    window = stream.window(1006)
-    context = Context(first_pass=False, radius=2)
-    assert stream.plan(stream.around(1006), context).stages == window.stages
-    assert decided.count(context) == 5  # the window, and the pairs of neighbours in it
 
 
 @pytest.mark.parametrize(("noise", "factor"), [(0.1, 8.0), (0.8, 0.7)])

@@ -110,9 +110,7 @@ ELEMENTS = {
 
 
 @pytest.mark.parametrize("names", ELEMENTS.values(), ids=ELEMENTS)
-def test_elements_beside_a_color_without_a_name_of_its_own(
-    whole: dict[str, np.ndarray], names: dict[str, str], tmp_path: Path
-) -> None:
+def test_elements_beside_a_color_without_a_name_of_its_own(whole, names, tmp_path):
     """The folder was refused; named by its pattern the color was denoised without its guides, and nothing was said."""
     home = tmp_path / "in"
     split(home, names)
@@ -229,9 +227,7 @@ def test_a_layer_that_was_made_again_makes_the_frame_again(tmp_path: Path, capsy
 
 
 @pytest.mark.parametrize("role", ["albedo", *seldom("normal")])
-def test_sequences_of_one_name_in_several_folders_are_told_apart(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], role: str
-) -> None:
+def test_sequences_of_one_name_in_several_folders_are_told_apart(tmp_path, capsys, role):
     """A folder for each layer, with equal names in all: what stood for one of them stood for all."""
     split(tmp_path, {name: f"{name}/####.exr" for name in (*ROLES, "color")})
     named = [word for name in ROLES for word in ("--layer", f"{name}={tmp_path / name / '####.exr'}")]

@@ -104,13 +104,7 @@ def test_frames_and_sizes():
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("levels", {"a": 0}),
-        ("size", (4, 4)),
-        ("film", (32, 36)),
-        ("reference_frames", (4,)),
-    ],
+    ("name", "value"), [("levels", {"a": 0}), ("size", (4, 4)), ("film", (32, 36)), ("reference_frames", (4,))]
 )
 def test_settings_that_cannot_be_are_refused(name, value):
     with pytest.raises(ValueError, match=name.rstrip("s").replace("_", " ")):

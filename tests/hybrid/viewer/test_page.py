@@ -1,7 +1,5 @@
 """The page of `ravg view` in a real browser, beside frames that are still being made."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from typing import Any

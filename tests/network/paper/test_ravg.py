@@ -7,17 +7,9 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from network.paper.ravg import ravg
+from tests.network.paper.test_blocks import random, ravg_by_sorting
 
 pytestmark = pytest.mark.neural
-
-
-def random(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> torch.Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
-
-
-def ravg_by_sorting(frames: torch.Tensor) -> torch.Tensor:
-    """The equation, read literally: drop the smallest and the largest, average the rest."""
-    return frames.sort(0).values[1:-1].mean(0)
 
 
 @pytest.mark.parametrize("count", [3, 4, 5, 6, 7])

@@ -198,9 +198,7 @@ def test_losses_are_over_those_of_the_clips_best_input(clips: Clips, make: Calla
         (0.001, 0.05, 0.15**2),  # an error at the start below 0.05 counts as that
     ],
 )
-def test_losses_are_over_those_of_the_network_at_the_start(
-    clips: Clips, before: float, after: float, expected: float
-) -> None:
+def test_losses_are_over_those_of_the_network_at_the_start(clips, before, after, expected):
     """The network at the start is the one whose images have no gradients."""
     batch, start = one_batch(clips), make_model().requires_grad_(False)
 
@@ -212,9 +210,7 @@ def test_losses_are_over_those_of_the_network_at_the_start(
 
 
 @pytest.mark.parametrize("float32", [True, False])
-def test_a_training_against_its_start_begins_at_the_loss_of_no_gain(
-    float32: bool, sets: tuple[Clips, Clips], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_training_against_its_start_begins_at_the_loss_of_no_gain(float32, sets, tmp_path, monkeypatch):
     """Both networks compute alike, in bfloat16 too."""
     monkeypatch.setattr("network.training.loop.has_bfloat16", lambda device: True)
     config = replace(AGAINST_START, steps=3, float32=float32, backbone_rate=1.0)
@@ -223,9 +219,7 @@ def test_a_training_against_its_start_begins_at_the_loss_of_no_gain(
     assert values[2] != pytest.approx(0.15**2, rel=1e-3)  # the start stays as it was
 
 
-def test_the_perceptual_loss_is_vgg19s(
-    sets: tuple[Clips, Clips], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_perceptual_loss_is_vgg19s(sets, tmp_path, monkeypatch):
     torch.manual_seed(0)
     vgg, read = VGG19().eval().requires_grad_(False), []
     monkeypatch.setattr(network.training.loop, "load_vgg19", lambda source: read.append(source) or vgg)
@@ -243,9 +237,7 @@ def test_the_perceptual_loss_is_vgg19s(
 # Training
 
 
-def test_training_on_noisy_targets_approaches_the_clean_image(
-    clips: Clips, sets: tuple[Clips, Clips], tmp_path: Path
-) -> None:
+def test_training_on_noisy_targets_approaches_the_clean_image(clips, sets, tmp_path):
     """Noise2Noise: no clean picture is ever shown, and still the error against it falls."""
     # Without fireflies: to reject those takes longer to learn, and until then they rule the loss.
     sampler = replace(CONFIG.sampler, fireflies=0)
@@ -275,9 +267,7 @@ def test_a_training_on_neighbours_asks_for_them(clips: Clips, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
-def test_a_pretrained_backbone_is_trained_with_its_share_of_the_rate(
-    share: float, sets: tuple[Clips, Clips], tmp_path: Path
-) -> None:
+def test_a_pretrained_backbone_is_trained_with_its_share_of_the_rate(share, sets, tmp_path):
     """The first step of Adam moves each weight by the learning rate."""
     model = make_robust()
     torch.nn.init.normal_(model.robust_average.correction[-1].weight)
@@ -291,9 +281,7 @@ def test_a_pretrained_backbone_is_trained_with_its_share_of_the_rate(
     assert backbone == pytest.approx(share * others, rel=0.05)
 
 
-def test_the_moving_average_is_saved_and_validated(
-    sets: tuple[Clips, Clips], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_moving_average_is_saved_and_validated(sets, tmp_path, monkeypatch):
     out, model, first = tmp_path / "w.safetensors", make_model(), make_model()
     validated: list[Model] = []
     monkeypatch.setattr(network.training.loop, "validate", lambda model, clips: validated.append(model) or {})
@@ -327,9 +315,7 @@ def test_a_training_is_determined_by_its_seed(sets: tuple[Clips, Clips], tmp_pat
     assert other != runs[0]
 
 
-def test_bfloat16_training_stays_near_float32(
-    sets: tuple[Clips, Clips], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bfloat16_training_stays_near_float32(sets, tmp_path, monkeypatch):
     none = sets[0].of([])
     monkeypatch.setattr("network.training.loop.has_bfloat16", lambda device: True)
     full = train(sets[0], none, make_model(), CONFIG, tmp_path / "a.safetensors")
@@ -338,9 +324,7 @@ def test_bfloat16_training_stays_near_float32(
     assert half == pytest.approx(full, rel=0.02)  # 8 bits in the features, averaged over all pixels
 
 
-def test_a_device_without_bfloat16_trains_in_float32(
-    sets: tuple[Clips, Clips], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_device_without_bfloat16_trains_in_float32(sets, tmp_path, monkeypatch):
     none = sets[0].of([])
     full = train(sets[0], none, make_model(), CONFIG, tmp_path / "a.safetensors")
     monkeypatch.setattr("network.training.loop.has_bfloat16", lambda device: False)
@@ -348,9 +332,7 @@ def test_a_device_without_bfloat16_trains_in_float32(
     assert same == full
 
 
-def test_a_compiled_network_trains_alike(
-    sets: tuple[Clips, Clips], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_compiled_network_trains_alike(sets, tmp_path, monkeypatch):
     """Traced in one piece as for a GPU, but run by torch itself: compiling takes minutes and shows no more of ours."""
     plain = train(sets[0], sets[0].of([]), make_model(), replace(CONFIG, steps=2), tmp_path / "a")
     compiling = torch.compile
@@ -362,9 +344,7 @@ def test_a_compiled_network_trains_alike(
 @pytest.mark.parametrize(
     ("name", "terms"), [*((name, "temporal") for name in MODELS), ("softmax", "power"), ("softmax", "spatial")]
 )
-def test_every_model_learns_with_all_of_its_weights(
-    name: str, terms: str, sets: tuple[Clips, Clips], tmp_path: Path
-) -> None:
+def test_every_model_learns_with_all_of_its_weights(name, terms, sets, tmp_path):
     model = MODELS[name]()
     if isinstance(model, RobustUNet):  # as after some steps: what starts as a constant hides what is before it
         torch.nn.init.normal_(model.robust_average.correction[-1].weight)
@@ -428,9 +408,7 @@ def test_two_processes_train_as_one_does_on_the_whole_batch(tmp_path: Path) -> N
     assert moved > 2e-3
 
 
-def test_a_batch_that_cannot_be_shared_is_an_error(
-    sets: tuple[Clips, Clips], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_batch_that_cannot_be_shared_is_an_error(sets, tmp_path, monkeypatch):
     monkeypatch.setattr(network.training.loop, "_in_group", lambda: True)
     monkeypatch.setattr(torch.distributed, "get_rank", lambda: 0)
     monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 4)
@@ -474,9 +452,7 @@ def test_a_training_that_is_killed_is_resumed_as_if_nothing_had_happened(tmp_pat
     assert not Path(f"{out}.state").exists()
 
 
-def test_a_state_that_is_missing_cut_short_or_of_another_training_is_an_error(
-    sets: tuple[Clips, Clips], tmp_path: Path
-) -> None:
+def test_a_state_that_is_missing_cut_short_or_of_another_training_is_an_error(sets, tmp_path):
     out = tmp_path / "w.safetensors"
     with pytest.raises(FileNotFoundError, match="resume: no file"):
         train(*sets, make_model(), CONFIG, out, resume=True)

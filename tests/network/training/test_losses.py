@@ -218,14 +218,7 @@ def test_terms_are_the_papers() -> None:
 
 @pytest.mark.parametrize(
     "terms",
-    [
-        temporal_terms(1),
-        temporal_terms(3),
-        temporal_terms(5),
-        temporal_terms(5, 0.25),
-        power_terms(3),
-        spatial_terms(5),
-    ],
+    [*map(temporal_terms, (1, 3, 5)), temporal_terms(5, 0.25), power_terms(3), spatial_terms(5)],
 )
 def test_temporal_loss_is_the_loss_of_renormalised_subsets(terms) -> None:  # type: ignore[no-untyped-def]
     """Zero the excluded frames' weights, renormalise the kernel, apply it: section 5 of the paper."""
@@ -269,16 +262,8 @@ def test_temporal_loss_does_not_depend_on_the_scale() -> None:
     terms = temporal_terms(3, 1.0)
     once = temporal_loss(relmse, Filtered(*sums, sums[1], color[:, 1]), color, target, modulation, scale, terms, 3.0)
     numerators, denominators = sums
-    scaled = temporal_loss(
-        relmse,
-        Filtered(numerators * 512, denominators, denominators, color[:, 1]),
-        color * 512,
-        target * 512,
-        modulation,
-        scale * 512,
-        terms,
-        3.0,
-    )
+    bright = Filtered(numerators * 512, denominators, denominators, color[:, 1])
+    scaled = temporal_loss(relmse, bright, color * 512, target * 512, modulation, scale * 512, terms, 3.0)
     torch.testing.assert_close(scaled, once)
 
 
