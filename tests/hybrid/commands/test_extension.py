@@ -8,10 +8,11 @@ import pytest
 
 from hybrid.cli import main
 from hybrid.commands import extension
+from tests.seldom import seldom
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["", "made/mine.zip"])
+@pytest.mark.parametrize("name", ["", *seldom("made/mine.zip")])
 def test_the_extension_holds_its_files_and_the_wheel(tmp_path, capsys, monkeypatch, name):
     if name:  # as a regular install finds them
         monkeypatch.setattr(extension, "__file__", str(tmp_path / "site-packages" / "hybrid" / "extension.py"))

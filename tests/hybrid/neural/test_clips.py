@@ -48,9 +48,19 @@ def prepare(shot, monkeypatch, tmp_path, **options) -> list[Clip]:
     return found
 
 
-def test_a_clip_holds_what_the_network_is_given_when_it_runs(dim, tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def middle(tmp_path_factory):
+    """The clip of the middle frame, and the window that it is made of."""
+    folder = tmp_path_factory.mktemp("dim")
+    shot = open_shot(SCENE.write(folder / "dim", edit=bright_window), frames=str(MIDDLE))
+    with pytest.MonkeyPatch.context() as patch:
+        (clip,) = prepare(shot, patch, folder)
+    return clip, FrameStream(shot, Rules(), first_pass=Classical(FINAL)).align(MIDDLE)
+
+
+def test_a_clip_holds_what_the_network_is_given_when_it_runs(middle, tmp_path, monkeypatch):
     """The exposure too, which used to be measured in two ways."""
-    (clip,) = prepare(open_shot(tmp_path / "dim", frames=str(MIDDLE)), monkeypatch, tmp_path)
+    clip, window = middle
     given = {}
 
     def spy(block, window):
@@ -60,8 +70,6 @@ def test_a_clip_holds_what_the_network_is_given_when_it_runs(dim, tmp_path, monk
     monkeypatch.setattr(RobustAverage, "is_prior", False)
     monkeypatch.setattr(RobustAverage, "forward", spy)
     save_model(tmp_path / "w.safetensors", build_preset("balanced"))
-    shot = open_shot(tmp_path / "dim", frames=str(MIDDLE))
-    window = FrameStream(shot, Rules(), first_pass=Classical(FINAL)).align(MIDDLE)
     with pytest.raises(StopIteration):
         open_network(tmp_path / "w.safetensors", precision="float32")(window)
     given |= {
@@ -74,12 +82,9 @@ def test_a_clip_holds_what_the_network_is_given_when_it_runs(dim, tmp_path, monk
         np.testing.assert_array_equal(value, wanted, err_msg=name)
 
 
-def test_frames_that_are_not_trusted_show_the_centre(dim, tmp_path, monkeypatch):
+def test_frames_that_are_not_trusted_show_the_centre(middle):
     """In proportion to the confidence, color and guides alike."""
-    (clip,) = prepare(open_shot(tmp_path / "dim", frames=str(MIDDLE)), monkeypatch, tmp_path)
-    window = FrameStream(open_shot(tmp_path / "dim", frames=str(MIDDLE)), Rules(), first_pass=Classical(FINAL)).align(
-        MIDDLE
-    )
+    clip, window = middle
     color, confidence = window.color, window.confidence[..., None]
     expected = confidence * color + (1 - confidence) * color[2]
     assert np.abs(expected - color).max() > 0.1 * color.mean()  # some are not trusted
@@ -90,10 +95,8 @@ def test_frames_that_are_not_trusted_show_the_centre(dim, tmp_path, monkeypatch)
         np.testing.assert_allclose(getattr(clip, name)[0].permute(0, 2, 3, 1).numpy(), expected, rtol=1e-4, atol=1e-5)
 
 
-def test_the_pseudo_reference_is_the_gated_average_and_no_noisy_frame(dim, tmp_path, monkeypatch):
-    (clip,) = prepare(open_shot(tmp_path / "dim", frames=str(MIDDLE)), monkeypatch, tmp_path)
-    shot = open_shot(tmp_path / "dim", frames=str(MIDDLE))
-    window = FrameStream(shot, Rules(), first_pass=Classical(FINAL)).align(MIDDLE)
+def test_the_pseudo_reference_is_the_gated_average_and_no_noisy_frame(middle):
+    clip, window = middle
     image = clip.pseudo_reference[0].permute(1, 2, 0).numpy()
     np.testing.assert_array_equal(image, gated_average(window))
     layers = SCENE.clean(2)

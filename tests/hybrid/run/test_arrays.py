@@ -100,47 +100,38 @@ def test_a_network_takes_a_first_pass_and_aovs_from_memory(shot):
     assert results[0].layers["glow"].shape == (40, 56, 3)
 
 
+PLAIN = {"color": np.ones((4, 4, 3))}
+
+
 @pytest.mark.parametrize(
     ("frames", "options", "words"),
     [
         ([], {}, "at least one"),
         ([{"albedo": np.ones((4, 4, 3))}], {}, "expected the layer color"),
-        ([{"color": np.ones((4, 4, 3)), "motion": np.ones((4, 4, 2))}], {}, "expected its convention"),
-        ([{"color": np.ones((4, 4, 3))}], {"passes": 2, "method": "network"}, "expected none for frames in memory"),
-        ([{"color": np.ones((4, 4, 3))}], {"first_pass": "x.####.exr"}, "expected one of"),
-        ([{"color": np.ones((4, 4, 3))}], {"numbers": [3]}, "frame 3 is not there"),
-        ([{"color": np.ones((4, 4, 3))}], {"numbers": 0}, "numbers is 0, expected a list"),
-        ([{"color": np.ones((4, 4, 3))}], {"motion": "none"}, "expected a convention"),
-        ([{"color": np.ones((4, 4, 3)), "glow": np.ones((4, 4, 3))}], {}, "'glow' is an AOV, expected none"),
-        (
-            [{"color": np.ones((4, 4, 3)), "Albedo": np.ones((4, 4, 3))}],
-            {},
-            "layer 'Albedo' is unknown, expected albedo",
-        ),
-        (
-            [{"color": np.ones((4, 4, 3)), "albdeo": np.ones((4, 4, 3))}],
-            {},
-            "layer 'albdeo' is unknown, expected albedo",
-        ),
+        ([{**PLAIN, "motion": np.ones((4, 4, 2))}], {}, "expected its convention"),
+        ([PLAIN], {"passes": 2, "method": "network"}, "expected none for frames in memory"),
+        ([PLAIN], {"first_pass": "x.####.exr"}, "expected one of"),
+        ([PLAIN], {"numbers": [3]}, "frame 3 is not there"),
+        ([PLAIN], {"numbers": 0}, "numbers is 0, expected a list"),
+        ([PLAIN], {"motion": "none"}, "expected a convention"),
+        ([{**PLAIN, "glow": np.ones((4, 4, 3))}], {}, "'glow' is an AOV, expected none"),
+        ([{**PLAIN, "Albedo": np.ones((4, 4, 3))}], {}, "layer 'Albedo' is unknown, expected albedo"),
+        ([{**PLAIN, "albdeo": np.ones((4, 4, 3))}], {}, "layer 'albdeo' is unknown, expected albedo"),
         ([{"colour": np.ones((4, 4, 3))}], {}, "layer 'colour' is unknown, expected color"),
         ([{"color": np.ones((4, 4, 3), complex)}], {}, "color has type complex128, expected float radiance"),
         ([{"color": np.ones((4, 4, 3), np.uint8)}], {}, "color has type uint8, expected float radiance"),
-        ([{"color": np.ones((4, 4, 3)), "depth": np.ones((4, 4), int)}], {}, "depth has type int64, expected float"),
-        ([{"color": np.ones((4, 4, 3)), "depth": np.ones((4, 5))}], {}, r"frame 0: depth is float32 \(4, 5\)"),
+        ([{**PLAIN, "depth": np.ones((4, 4), int)}], {}, "depth has type int64, expected float"),
+        ([{**PLAIN, "depth": np.ones((4, 5))}], {}, r"frame 0: depth is float32 \(4, 5\)"),
         (
-            [{"color": np.ones((4, 4, 3)), "motion": np.ones((4, 4, 3))}],
+            [{**PLAIN, "motion": np.ones((4, 4, 3))}],
             {"motion": "next,pixels,y-down"},
             r"frame 0: motion is \(4, 4, 3\), expected \(4, 4, 2\) for next,pixels,y-down",
         ),
         ([{"color": np.ones((0, 4, 3))}], {}, "expected at least one pixel"),
         ([np.ones((4, 4, 3))], {}, "frame 0 is a ndarray, expected names of layers"),
-        ({"color": np.ones((4, 4, 3))}, {}, "a mapping of numbers to frames"),
-        (({"color": np.ones((4, 4, 3))} for _ in range(2)), {}, "expected a list of at least one frame"),
-        (
-            [{"color": np.ones((4, 4, 3))}],
-            {"method": "network", "aov_sum": "beauty"},
-            "AOVs of which the color is the sum",
-        ),
+        (PLAIN, {}, "a mapping of numbers to frames"),
+        ((PLAIN for _ in range(2)), {}, "expected a list of at least one frame"),
+        ([PLAIN], {"method": "network", "aov_sum": "beauty"}, "AOVs of which the color is the sum"),
     ],
 )
 def test_what_cannot_be_done_is_refused_at_once(frames, options, words):
