@@ -19,6 +19,7 @@ os.fsync = lambda descriptor: None
 import argparse
 import functools
 import importlib.metadata
+import importlib.util
 import re
 import shutil
 import signal
@@ -35,6 +36,9 @@ import pytest
 importlib.metadata.version = functools.cache(importlib.metadata.version)
 
 from tests.scenes import Scene
+
+HAS_TORCH = importlib.util.find_spec("torch") is not None
+NETWORKS = {Path(__file__).parent / "network", Path(__file__).parent / "hybrid" / "neural"}
 
 
 def parse_part(text: str) -> tuple[int, int]:
@@ -62,8 +66,25 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     config.hook.pytest_deselected(items=[item for item in items if not taken(item)])
     items[:] = [item for item in items if taken(item)]
     for item in items:
+        if needs_torch(item.path):
+            item.add_marker(pytest.mark.neural)
+        if not HAS_TORCH and item.get_closest_marker("neural"):
+            item.add_marker(pytest.mark.skip(reason="torch is not installed"))
         if sys.platform == "win32" and item.get_closest_marker("posix"):
             item.add_marker(pytest.mark.skip(reason="needs POSIX: pipes, signals, links or shells"))
+
+
+def needs_torch(path: Path) -> bool:
+    """Whether tests are of networks: all files of two folders, but for that of the settings of trainings."""
+    return path.name != "test_config.py" and not NETWORKS.isdisjoint(path.parents)
+
+
+def pytest_ignore_collect(collection_path: Path) -> bool | None:
+    return True if not HAS_TORCH and needs_torch(collection_path) else None
+
+
+def pytest_report_header() -> str | None:
+    return None if HAS_TORCH else "torch is not installed: tests/network and tests/hybrid/neural are left out"
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -1,6 +1,7 @@
 """The parts into which the tests are divided."""
 
 import argparse
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -20,7 +21,9 @@ def taken(part, expression=""):
     marker = SimpleNamespace(name="reliability")
     items = [
         SimpleNamespace(
-            nodeid=f"test_a.py::test_a[{n}]", get_closest_marker=lambda name, n=n: marker if n % 2 else None
+            nodeid=f"test_a.py::test_a[{n}]",
+            path=Path("test_a.py"),
+            get_closest_marker=lambda name, n=n: marker if n % 2 and name == marker.name else None,
         )
         for n in range(40)
     ]

@@ -73,7 +73,6 @@ def test_the_picture_is_finite_and_in_range(layer, value, where):
 @values
 @where
 def test_the_network_is_finite(value, precision, where):
-    pytest.importorskip("torch")
     from hybrid.neural import open_network
     from network.checkpoint import shipped_weights
 

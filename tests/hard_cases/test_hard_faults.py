@@ -174,7 +174,6 @@ def test_a_frame_that_is_rendered_again_while_it_is_used_ends_the_run(tmp_path, 
 
 @pytest.mark.neural
 def test_resume_of_the_network_gives_the_same_bytes(tmp_path):
-    pytest.importorskip("torch")
     folder = Scene().write(tmp_path / "in")
     words = ["denoise", str(folder), "--first-pass", "nlm", "-o"]
     assert main([*words, str(tmp_path / "whole")]) == 0
@@ -364,7 +363,6 @@ def test_an_interrupt_within_a_dispatcher_of_numba_is_one():
 @pytest.mark.neural
 @pytest.mark.parametrize("rows", [192, *seldom(64)])
 def test_the_network_in_parts_is_the_network(tall, rows):
-    pytest.importorskip("torch")
     from hybrid.neural import open_network
     from network.checkpoint import shipped_weights
 

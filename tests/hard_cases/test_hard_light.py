@@ -52,7 +52,6 @@ def test_the_network_scales_with_the_light(network, record_property):
 )
 def test_a_bright_window_lets_no_noise_into_the_room(options, factor):
     """Errors of the room were measured against the mean with the window, and samples blended in for 2 to 6 dB."""
-    pytest.importorskip("torch")
     size, rng = (64, 96), np.random.default_rng(3)
     truth = np.broadcast_to(np.linspace(0.2, 0.4, size[1], dtype=np.float32)[:, None], (*size, 3))
     albedo = np.full_like(truth, 0.5)
@@ -75,7 +74,6 @@ def test_a_bright_window_lets_no_noise_into_the_room(options, factor):
 @pytest.mark.parametrize("options", [{"preset": "final"}, {"preset": "balanced", "first_pass": "bundled"}], ids=str)
 def test_frames_beside_a_black_one_scale_with_the_light(options):
     """Pairs with a black frame were compared by an exposure of 1, and networks leave a little light on black."""
-    pytest.importorskip("torch")
     unit = np.float32(2.0**-12)
 
     def layers(frame, scale):

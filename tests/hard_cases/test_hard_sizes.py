@@ -41,7 +41,6 @@ def test_any_size_works(size, record_property):
 @pytest.mark.neural
 @pytest.mark.parametrize("size", SIZES, ids=[f"{h}x{w}" for h, w in SIZES])
 def test_the_network_takes_any_size(size):
-    pytest.importorskip("torch")
     from hybrid.neural import open_network
     from network.checkpoint import shipped_weights
 
@@ -57,7 +56,6 @@ def test_the_network_takes_any_size(size):
 )
 def test_first_passes_of_any_size_keep_the_light(size, source):
     """In all eight orientations, one for each frame."""
-    pytest.importorskip("torch")
     frames = [{"color": frame.color, "albedo": frame.albedo, "normal": frame.normal} for frame in noisy(size, 9)]
     light = np.mean([frame["color"] for frame in frames])
     results = [result.layers["color"] for result in denoise_arrays(frames, preset="balanced", first_pass=source)]
@@ -83,7 +81,6 @@ def test_more_than_32767_pixels_on_a_side(size):
 @pytest.mark.neural
 @pytest.mark.reliability
 def test_more_than_32767_pixels_through_the_network():
-    pytest.importorskip("torch")
     from hybrid.neural import open_network
     from network.checkpoint import shipped_weights
 
@@ -107,7 +104,6 @@ def test_tiles_of_any_size_give_the_same_picture(precision, tolerance):
 
     The picture is wider than a tile with its halo, so that tiles lack what is beyond.
     """
-    pytest.importorskip("torch")
     from hybrid.neural import open_network
     from network.checkpoint import shipped_weights
 

@@ -330,7 +330,6 @@ def test_estimates_are_not_overwritten(shot_folder, tmp_path, capsys, method):
 @pytest.mark.parametrize("option", ["-o", "--preview", "--breakdown"])
 def test_the_input_is_not_overwritten_by_any_pass(shot_folder, tmp_path, capsys, passes, option):
     """The second pass reads what the first has made, and used to write over what that was made from."""
-    pytest.importorskip("torch")
     before = {path: path.read_bytes() for path in shot_folder.iterdir()}
     words = ["denoise", shot_folder, "--first-pass", "nlm", "--passes", passes]
     if option == "-o":
@@ -434,7 +433,6 @@ def test_the_bundled_network_makes_the_estimates_where_asked(shot_folder, tmp_pa
     ],
 )
 def test_bad_usage_of_the_network_is_two(options, shot_folder, tmp_path, capsys, monkeypatch):
-    pytest.importorskip("torch")
     test_bad_usage_is_two_and_makes_nothing(options, shot_folder, tmp_path, capsys, monkeypatch)
 
 

@@ -54,7 +54,6 @@ def denoise(shot_folder, tmp_path):
 @pytest.mark.neural
 def test_frames_that_are_measured_for_a_budget_are_not_kept(denoise, tmp_path, monkeypatch):
     """They are parts of frames."""
-    pytest.importorskip("torch")
     pytest.importorskip("pyoidn")
     monkeypatch.setattr(budget, "SIDE", 16)
     words = ["--preset", "auto", "--budget", "1000s", "--first-pass", "oidn-fast"]
@@ -138,7 +137,6 @@ def test_the_network_has_the_tile_and_the_layers_that_were_asked_for(monkeypatch
 
 @pytest.mark.neural
 def test_only_the_last_pass_resumes_keeps_going_and_counts_weights(shot_folder, tmp_path, monkeypatch):
-    pytest.importorskip("torch")
     runs = []
 
     def denoise_frames(views, output, denoiser, rules, settings, **options):
@@ -156,7 +154,6 @@ def test_only_the_last_pass_resumes_keeps_going_and_counts_weights(shot_folder, 
 
 @pytest.mark.neural
 def test_the_weights_of_a_bundled_first_pass_are_in_the_header(shot_folder, tmp_path):
-    pytest.importorskip("torch")
     options = job.DenoiseOptions(first_pass="bundled")
     made = job.Job.open(open_shot(shot_folder), tmp_path / "out", options).settings
     assert len(made["bundled"]) == len(made["weights"]) == 16
@@ -164,7 +161,6 @@ def test_the_weights_of_a_bundled_first_pass_are_in_the_header(shot_folder, tmp_
 
 @pytest.mark.neural
 def test_the_record_names_the_weights(denoise):
-    pytest.importorskip("torch")
     out = denoise("out", "--weights", ROOT / "tests" / "data" / "small.safetensors")
     ((_, record),) = read_records(out)
     assert record["preset"] == "small.safetensors"

@@ -59,7 +59,6 @@ def folder(tmp_path, monkeypatch):
 @pytest.mark.posix
 @pytest.mark.usefixtures("folder")
 def test_in_a_shell(capsys):
-    pytest.importorskip("torch")
     commands = list(transcript("command-line.md", "transcript"))
     assert len(commands) == 5
     for (program, *words), answer in commands:
@@ -76,7 +75,6 @@ def test_in_a_shell(capsys):
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT for other processes")
 @pytest.mark.usefixtures("interrupts", "folder")
 def test_looking_at_a_shot(capsys):
-    pytest.importorskip("torch")
     ((_, *words), answer), ((_, *look), (url, end)) = transcript("view.md", "transcript")
     assert main(words) == 0
     lines = [said(line) for line in capsys.readouterr().err.splitlines()]
@@ -122,7 +120,6 @@ RUN = [(page, lines) for page in PAGES for marker, lines in commands_of(page) if
     ids=[page.name for page, _ in RUN],
 )
 def test_commands_run(page, lines, folder):
-    pytest.importorskip("torch")
     for line in lines:
         _, *words = shlex.split(line)
         assert main(words) == 0, line
@@ -231,7 +228,6 @@ def test_every_page_is_in_the_index():
 @pytest.mark.usefixtures("folder")
 @pytest.mark.parametrize("index", [0, 1])
 def test_python_of_the_documentation_runs(index, capsys):
-    pytest.importorskip("torch")
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(encoding="utf-8"), re.DOTALL)
     assert len(blocks) == 2
     exec(compile(blocks[index], "python.md", "exec"), {})

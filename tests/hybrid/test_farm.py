@@ -93,7 +93,6 @@ def test_the_template_is_valid(openjd):
 @pytest.mark.openjd
 @pytest.mark.neural
 def test_open_job_description_runs_chunks_and_reads_their_progress(openjd, tmp_path):
-    pytest.importorskip("torch")
     shot, out = Scene(frames=3).write(tmp_path / "noisy"), tmp_path / "out"
     ravg = tmp_path / "ravg"
     ravg.write_text(f'#!/bin/sh\ncd "{ROOT}" && exec "{sys.executable}" -m hybrid.cli "$@"\n')

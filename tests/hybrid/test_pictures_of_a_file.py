@@ -149,7 +149,6 @@ def stereo(folder: Path) -> Path:
 
 @pytest.mark.neural
 def test_two_passes_and_the_breakdown_of_both_eyes_are_those_of_mono_files(tmp_path: Path) -> None:
-    pytest.importorskip("torch")
     options = ["--weights", str(WEIGHTS), "--frames", "10", "--passes", "2", "--breakdown"]
     alone: dict[str, ExrImage] = {}
     sheets = {}

@@ -3,8 +3,6 @@
 from importlib.util import find_spec
 
 import pytest
-
-pytest.importorskip("torch")
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -15,8 +13,6 @@ from network.cpu import convolution
 from network.oidn_weights import build_unet, load_oidn
 from network.unet import OidnUNet
 from tests.network.oidn_like import compressed, decibels, denoise, made_up_unet, scene
-
-pytestmark = pytest.mark.neural
 
 
 @pytest.fixture

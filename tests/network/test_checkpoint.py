@@ -1,7 +1,5 @@
 """Weights in files: they come back, and what is no such file is refused."""
 
-# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
-
 import json
 import os
 import stat
@@ -10,16 +8,12 @@ import sys
 from pathlib import Path
 
 import pytest
-
-torch = pytest.importorskip("torch")
-
+import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
 from network.checkpoint import build, describe, find_weights, load_model, save_model, shipped_weights
 from tests.network.small import MODELS, make_model, make_robust, notes_of
-
-pytestmark = pytest.mark.neural
 
 
 def test_weights_come_back(tmp_path: Path) -> None:

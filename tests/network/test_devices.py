@@ -1,15 +1,10 @@
 """Devices of torch have OIDN's names."""
 
-# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
-
 import pytest
-
-torch = pytest.importorskip("torch")
+import torch
 
 from network import devices
 from network.devices import DEVICES, find_device
-
-pytestmark = pytest.mark.neural
 
 
 def only(monkeypatch, *, cuda=False, hip=None, xpu=False, mps=False):

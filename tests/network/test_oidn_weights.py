@@ -6,16 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("torch")
 import torch
 
 from network import oidn_weights
 from network.oidn_weights import OIDN_WEIGHTS, build_unet, load_oidn, read_tza
 from network.unet import OidnUNet, OidnUNetConfig
 from tests.network.oidn_like import tza, weights_of
-
-pytestmark = pytest.mark.neural
 
 
 @pytest.mark.oidn

@@ -1,12 +1,9 @@
 """Networks by name."""
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from network.presets import PRESETS, build_preset  # noqa: E402
-
-pytestmark = pytest.mark.neural
+from network.presets import PRESETS, build_preset
 
 
 @pytest.mark.parametrize("name", PRESETS)

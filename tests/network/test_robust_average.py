@@ -1,16 +1,11 @@
 """The Robust Average block on images."""
 
-# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
-
 import numpy as np
 import pytest
-
-torch = pytest.importorskip("torch")
+import torch
 
 from network.robust_average import MOST, RobustAverage, UNetWindow, outermost_first, pool
 from nlm import pooling
-
-pytestmark = pytest.mark.neural
 
 
 def uniform(*shape: int, seed: int) -> torch.Tensor:

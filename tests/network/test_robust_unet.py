@@ -1,10 +1,7 @@
 """The final stage: what it makes of a window before any training, and in which precision."""
 
-# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
-
 import pytest
-
-torch = pytest.importorskip("torch")
+import torch
 
 from network import strips as strips_module
 from network.oidn_weights import find_library, load_oidn
@@ -12,8 +9,6 @@ from network.robust_average import UNetWindow, pool
 from network.robust_unet import AVERAGE_BLEND, MIRRORED, RobustUNet, RobustUNetConfig, for_inference, start_from_oidn
 from network.unet import denoise_color
 from tests.network.test_robust_average import make_window, uniform
-
-pytestmark = pytest.mark.neural
 
 
 def library_is_there() -> bool:

@@ -1,13 +1,10 @@
 """Pictures made strip by strip are those made at once."""
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from network import strips as module  # noqa: E402
-from tests.network.oidn_like import made_up_unet  # noqa: E402
-
-pytestmark = pytest.mark.neural
+from network import strips as module
+from tests.network.oidn_like import made_up_unet
 
 
 def test_strips_and_the_whole_are_one_picture(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,12 +1,8 @@
 """Curves, and their inverses."""
 
-import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from network.transfer import clip, pu_forward, pu_inverse, srgb_forward, srgb_inverse  # noqa: E402
-
-pytestmark = pytest.mark.neural
+from network.transfer import clip, pu_forward, pu_inverse, srgb_forward, srgb_inverse
 
 
 def test_curves_and_their_inverses() -> None:

@@ -3,8 +3,6 @@
 from importlib.util import find_spec
 
 import pytest
-
-pytest.importorskip("torch")
 import torch
 from torch import nn
 
@@ -15,7 +13,6 @@ from network.oidn_weights import load_oidn
 from network.unet import OidnUNet, OidnUNetConfig, denoise_albedo, denoise_normal
 from tests.network.oidn_like import as_image, as_tensor, compressed, decibels, denoise, made_up_unet, scene
 
-pytestmark = pytest.mark.neural
 needs_oidn = [pytest.mark.oidn, pytest.mark.skipif(find_spec("pyoidn") is None, reason="pyoidn is not installed")]
 
 

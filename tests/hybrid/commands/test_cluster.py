@@ -104,7 +104,6 @@ def test_options_are_passed_on_as_they_were_given():
 @pytest.mark.neural
 @pytest.mark.posix
 def test_what_the_documentation_says(cluster, tmp_path, monkeypatch, capsys):
-    pytest.importorskip("torch")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     documented = "tcp://192.168.1.10:8786"
@@ -137,7 +136,6 @@ def test_random_shots_are_rendered_by_the_workers(cluster, tmp_path, capsys):
 
 @pytest.mark.neural
 def test_clips_are_made_by_the_workers(cluster, tmp_path, capsys):
-    pytest.importorskip("torch")
     shots = [str(Scene(frames=3).write(tmp_path / name)) for name in ("one", "two")]
     words = ["make-clips", *shots, "-o", str(tmp_path / "clips"), "--tile", "0", "--first-pass", "nlm", "--window", "3"]
     assert main([*words, "--scheduler", cluster[0]]) == 0, capsys.readouterr().err

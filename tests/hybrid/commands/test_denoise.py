@@ -37,7 +37,6 @@ ALONE = ["--first-pass", "nlm", "--precision", "float32"]
 
 @network
 def test_the_preset_is_the_network_that_runs(run):
-    pytest.importorskip("torch")
     made = {preset: run("--preset", preset, *ALONE) for preset in ("fast", "balanced", "quality")}
     assert {preset: header["ravg/preset"] for preset, (_, header) in made.items()} == {name: name for name in made}
     assert len({header["weights"] for _, header in made.values()}) == 3
@@ -48,7 +47,6 @@ def test_the_preset_is_the_network_that_runs(run):
 
 @network
 def test_tile_and_precision_are_those_that_were_asked_for(run):
-    pytest.importorskip("torch")
     _, header = run(*ALONE, "--tile", 32)
     assert (header["tile"], header["precision"]) == (32, "float32")
     assert run("--first-pass", "nlm", "--precision", "bfloat16")[1]["precision"] == "bfloat16"
@@ -56,14 +54,12 @@ def test_tile_and_precision_are_those_that_were_asked_for(run):
 
 @network
 def test_the_threshold_drops_taps(run):
-    pytest.importorskip("torch")
     low, high = (run("--weights", KERNELS, "--threshold", value)[0] for value in (0, 0.9))
     assert not np.array_equal(low, high)
 
 
 @network
 def test_without_a_first_pass_a_network_takes_the_classical_one(run):
-    pytest.importorskip("torch")
     color, header = run("--first-pass", "none", "--precision", "float32")
     assert header["ravg/first-pass"] == "nlm"
     np.testing.assert_array_equal(color, run(*ALONE)[0])
@@ -93,7 +89,6 @@ def test_the_first_pass_is_kept_and_read_again(run, tmp_path):
 
 @network
 def test_the_second_pass_starts_from_the_frames_of_the_first(run, tmp_path, capsys):
-    pytest.importorskip("torch")
     _, header = run(*ALONE, "--passes", 2)
     assert header["ravg/first-pass"] == "pass 1 of 2"
     assert (header["first-pass"], header["passes"]) == ("nlm", 2)

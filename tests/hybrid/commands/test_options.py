@@ -58,7 +58,6 @@ class AskedError(Exception):
 
 @pytest.mark.neural
 def test_denoise_hands_on_all_that_is_said(shot_folder, tmp_path, monkeypatch):
-    pytest.importorskip("torch")
 
     def refuse(shot: Any, output: str, options: DenoiseOptions, *_: Any) -> None:
         raise AskedError(shot, output, options)

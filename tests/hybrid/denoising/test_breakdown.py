@@ -83,7 +83,6 @@ def test_the_picture_shows_the_frames_in_the_order_of_time(tmp_path):
 @pytest.mark.neural
 def test_a_first_frame_gets_nothing_from_before_it(tmp_path):
     """The breakdown of a shot's first frame names the next one, as the one after."""
-    pytest.importorskip("torch")
     scene = Scene(frames=2, step=(0, 0), height=64, width=64, noise=0.05)
     noisy = scene.write(tmp_path / "noisy")
     words = ["denoise", str(noisy), "-o", str(tmp_path / "out"), "--first-pass", "none"]

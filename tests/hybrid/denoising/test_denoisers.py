@@ -25,7 +25,6 @@ def test_with_a_first_pass_it_is_the_gated_average():
 @pytest.mark.neural
 @pytest.mark.parametrize("preset", ["fast", "balanced", "quality"])
 def test_a_network_says_what_its_pixels_depend_on(preset):
-    pytest.importorskip("torch")
     denoiser = open_denoiser(DenoiseOptions(preset=preset, tile=64, precision="float32", device="cpu"))
     assert denoiser.settings == {"tile": 64, "threshold": None, "precision": "float32"}
     assert denoiser.radius == (3 if preset == "quality" else 2)

@@ -3,10 +3,6 @@
 import numpy as np
 import pytest
 
-from tests.scenes import Scene, only
-
-pytest.importorskip("torch")
-
 from hybrid.checks.validation import validate_layers
 from hybrid.denoising.first_pass import Classical
 from hybrid.denoising.pseudo_reference import DRAFT
@@ -14,8 +10,7 @@ from hybrid.denoising.stream import FrameStream
 from hybrid.files.shots import open_shot
 from hybrid.neural import open_network
 from network.checkpoint import shipped_weights
-
-pytestmark = pytest.mark.neural
+from tests.scenes import Scene, only
 
 STAGES = {"demodulate", "outliers", "warp"}
 SCENE = Scene(height=70, width=90, frames=5)

@@ -1,11 +1,8 @@
 """Training clips: what they hold is what the network is given, and what it should say."""
 
-# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
-
 import numpy as np
 import pytest
-
-torch = pytest.importorskip("torch")
+import torch
 
 from hybrid.denoising import first_pass, pseudo_reference
 from hybrid.denoising.first_pass import Classical, find_first_pass
@@ -22,8 +19,6 @@ from network.robust_average import RobustAverage
 from network.training.clips import Clip, Sample, open_clips
 from network.training.loop import centre_of
 from tests.scenes import Scene
-
-pytestmark = pytest.mark.neural
 
 SCENE = Scene(height=70, width=90, frames=5)
 MIDDLE = SCENE.first + 2

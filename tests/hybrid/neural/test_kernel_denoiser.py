@@ -4,17 +4,12 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import pytest
-
-pytest.importorskip("torch")
 
 from hybrid.denoising.breakdown import Breakdown
 from hybrid.denoising.stream import FrameStream
 from hybrid.files.shots import open_shot
 from hybrid.neural import open_network
 from tests.scenes import only
-
-pytestmark = pytest.mark.neural
 
 STAGES = {"demodulate", "outliers", "warp"}
 

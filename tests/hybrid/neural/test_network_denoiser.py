@@ -1,22 +1,18 @@
 import cv2
 import numpy as np
 import pytest
+import torch
 
+from hybrid.checks.validation import validate_layers
+from hybrid.denoising.breakdown import Breakdown
+from hybrid.denoising.first_pass import Classical
+from hybrid.denoising.pseudo_reference import DRAFT
+from hybrid.denoising.stream import FrameStream
+from hybrid.files.shots import open_shot
+from hybrid.neural import open_network
+from network.checkpoint import save_model, shipped_weights
+from network.presets import build_preset
 from tests.scenes import Scene, only
-
-torch = pytest.importorskip("torch")
-
-from hybrid.checks.validation import validate_layers  # noqa: E402
-from hybrid.denoising.breakdown import Breakdown  # noqa: E402
-from hybrid.denoising.first_pass import Classical  # noqa: E402
-from hybrid.denoising.pseudo_reference import DRAFT  # noqa: E402
-from hybrid.denoising.stream import FrameStream  # noqa: E402
-from hybrid.files.shots import open_shot  # noqa: E402
-from hybrid.neural import open_network  # noqa: E402
-from network.checkpoint import save_model, shipped_weights  # noqa: E402
-from network.presets import build_preset  # noqa: E402
-
-pytestmark = pytest.mark.neural
 
 STAGES = {"demodulate", "outliers", "warp"}
 SCENE = Scene(height=70, width=90, frames=5)

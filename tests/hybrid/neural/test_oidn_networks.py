@@ -1,14 +1,11 @@
 """OIDN's networks in torch give OIDN's pictures, whatever its mode, and stand for it where they are quicker."""
 
-# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
-
 import importlib.util
 from dataclasses import replace
 
 import numpy as np
 import pytest
-
-torch = pytest.importorskip("torch")
+import torch
 
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr

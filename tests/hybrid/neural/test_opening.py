@@ -2,18 +2,13 @@
 
 import pytest
 
+from hybrid.denoising.stream import FrameStream
+from hybrid.files.shots import open_shot
+from hybrid.neural import open_network
+from hybrid.neural.oidn_networks import HALO, SCRATCH, TILE
+from network.checkpoint import find_weights, save_model, shipped_weights
+from network.presets import build_preset
 from tests.scenes import Scene, only
-
-torch = pytest.importorskip("torch")
-
-from hybrid.denoising.stream import FrameStream  # noqa: E402
-from hybrid.files.shots import open_shot  # noqa: E402
-from hybrid.neural import open_network  # noqa: E402
-from hybrid.neural.oidn_networks import HALO, SCRATCH, TILE  # noqa: E402
-from network.checkpoint import find_weights, save_model, shipped_weights  # noqa: E402
-from network.presets import build_preset  # noqa: E402
-
-pytestmark = pytest.mark.neural
 
 
 @pytest.fixture(params=["balanced", "unet"])

@@ -3,11 +3,7 @@
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
-
-from hybrid.neural.tiling import image_of, pad, tensor_of, tiles  # noqa: E402
-
-pytestmark = pytest.mark.neural
+from hybrid.neural.tiling import image_of, pad, tensor_of, tiles
 
 
 def test_a_picture_comes_back_from_its_tensor() -> None:

@@ -4,17 +4,14 @@ import importlib.util
 from pathlib import Path
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from hybrid.neural import train as module  # noqa: E402
-from hybrid.neural.train import TrainInputs, _initial_model  # noqa: E402
-from network.checkpoint import load_model, shipped_weights  # noqa: E402
-from network.oidn_weights import load_oidn  # noqa: E402
-from network.presets import build_preset  # noqa: E402
-from network.training.config import TrainConfig  # noqa: E402
-
-pytestmark = pytest.mark.neural
+from hybrid.neural import train as module
+from hybrid.neural.train import TrainInputs, _initial_model
+from network.checkpoint import load_model, shipped_weights
+from network.oidn_weights import load_oidn
+from network.presets import build_preset
+from network.training.config import TrainConfig
 
 
 class FiveFrames:

@@ -6,23 +6,18 @@ import cv2
 import numpy as np
 import pytest
 
+from hybrid.alignment.window import WarpSources
+from hybrid.denoising.first_pass import Classical, PerFrame
+from hybrid.denoising.plan import Rules
+from hybrid.denoising.pseudo_reference import DRAFT, gated_average
+from hybrid.denoising.stabilize import Denoised, FrameDenoiser
+from hybrid.denoising.stream import FrameStream
+from hybrid.files.shots import open_shot
+from hybrid.neural import open_network, unet_denoiser
+from hybrid.neural.unet_denoiser import clean_guides
+from network.checkpoint import shipped_weights
+from network.robust_unet import RobustUNet
 from tests.scenes import Scene, denoise_view, only
-
-torch = pytest.importorskip("torch")
-
-from hybrid.alignment.window import WarpSources  # noqa: E402
-from hybrid.denoising.first_pass import Classical, PerFrame  # noqa: E402
-from hybrid.denoising.plan import Rules  # noqa: E402
-from hybrid.denoising.pseudo_reference import DRAFT, gated_average  # noqa: E402
-from hybrid.denoising.stabilize import Denoised, FrameDenoiser  # noqa: E402
-from hybrid.denoising.stream import FrameStream  # noqa: E402
-from hybrid.files.shots import open_shot  # noqa: E402
-from hybrid.neural import open_network, unet_denoiser  # noqa: E402
-from hybrid.neural.unet_denoiser import clean_guides  # noqa: E402
-from network.checkpoint import shipped_weights  # noqa: E402
-from network.robust_unet import RobustUNet  # noqa: E402
-
-pytestmark = pytest.mark.neural
 
 SCENE = Scene(height=40, width=48, frames=5)
 

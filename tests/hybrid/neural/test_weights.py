@@ -1,15 +1,12 @@
 """The weights that are shipped, on the shot that is bundled."""
 
-# ruff: noqa: E402 - nothing of hybrid.neural can be imported before it is known that torch is there
-
 import re
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-
-torch = pytest.importorskip("torch")
+import torch
 
 from hybrid.comparison.metrics import mean_bias, psnr
 from hybrid.denoising.first_pass import NETWORKS, Classical
@@ -23,8 +20,6 @@ from network.presets import build_preset
 from network.robust_average import RobustAverage
 from nlm.average import robust_average
 from tests.seldom import seldom
-
-pytestmark = pytest.mark.neural
 
 SHOT = Path(__file__).parents[3] / "examples" / "shot"
 FRAME = 11

@@ -48,7 +48,6 @@ def test_they_are_the_frames_of_files(shot, tmp_path, options):
 @pytest.mark.parametrize("strength", [0.0, 0.25])
 def test_a_share_of_the_noise_stays_in_all_layers(strength):
     """Parts add up to the color as before, and what was not rendered is repaired all the same."""
-    pytest.importorskip("torch")
     random = np.random.default_rng(1)
     diffuse, glossy = random.gamma(2, 0.2, (2, 3, 32, 48, 3)).astype(np.float32)
     alpha = random.uniform(0.2, 0.8, (3, 32, 48)).astype(np.float32)
@@ -90,7 +89,6 @@ def test_frames_are_looked_up_as_they_are_needed_and_work_ends_where_asked(shot)
 
 @pytest.mark.neural
 def test_a_network_takes_a_first_pass_and_aovs_from_memory(shot):
-    pytest.importorskip("torch")
     frames = [
         {**layers, "estimate": layers["color"], "glow": layers["color"]}
         for layers in ({"color": frame["color"]} for frame in layers_of(shot).values())
@@ -141,7 +139,6 @@ def test_what_cannot_be_done_is_refused_at_once(frames, options, words):
 
 @pytest.mark.neural
 def test_light_passes_add_up_to_the_color_as_those_of_files():
-    pytest.importorskip("torch")
     rng = np.random.default_rng(1)
     frames = []
     for _ in range(3):
@@ -195,6 +192,5 @@ def test_frames_of_another_size_are_refused():
 
 @pytest.mark.neural
 def test_the_example_runs():
-    pytest.importorskip("torch")
     tried = doctest.testmod(arrays)
     assert (tried.attempted, tried.failed) == (4, 0)

@@ -55,7 +55,6 @@ def test_it_resumes_what_would_be_the_same_alone(shot_folder, tmp_path, changed)
 @pytest.mark.neural
 def test_it_resumes_with_the_same_weights_alone(shot_folder, tmp_path):
     """Weights exchanged under one name were no reason."""
-    pytest.importorskip("torch")
     from safetensors import safe_open
     from safetensors.numpy import save_file
 
@@ -73,7 +72,6 @@ def test_it_resumes_with_the_same_weights_alone(shot_folder, tmp_path):
 @pytest.mark.neural
 @pytest.mark.posix
 def test_the_example_runs(tmp_path, monkeypatch):
-    pytest.importorskip("torch")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     tried = doctest.testmod(job)

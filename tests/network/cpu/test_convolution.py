@@ -1,17 +1,11 @@
 """A convolution with what is added to it and its ReLU is what the three are one after the other."""
 
-# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
-
 import pytest
-
-torch = pytest.importorskip("torch")
-
+import torch
 from torch.nn import functional
 
 from network.cpu import convolution
 from network.cpu.convolution import can_fuse, convolve
-
-pytestmark = pytest.mark.neural
 
 
 @pytest.mark.parametrize("fused", [True, False])

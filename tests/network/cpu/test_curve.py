@@ -1,16 +1,10 @@
 """The transfer curve from tables is that of the functions."""
 
-# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
-
 import numpy as np
-import pytest
-
-torch = pytest.importorskip("torch")
+import torch
 
 from network import transfer
 from network.cpu.curve import can_tabulate, decode, encode
-
-pytestmark = pytest.mark.neural
 
 
 def pictures(values: np.ndarray) -> tuple[torch.Tensor, np.ndarray]:

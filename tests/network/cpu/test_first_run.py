@@ -1,12 +1,7 @@
 """The program beside a first run compiles all of this package that the run needs."""
 
-# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
-
 import numpy as np
-import pytest
 from numba.core import event
-
-torch = pytest.importorskip("torch")
 
 from hybrid.denoising.first_pass import Classical
 from hybrid.denoising.pseudo_reference import DRAFT
@@ -16,8 +11,6 @@ from hybrid.neural import open_network, shipped_weights
 from hybrid.neural.oidn_networks import denoise_bundled
 from network.cpu.first_run import compile_loops
 from tests.scenes import Scene, only
-
-pytestmark = pytest.mark.neural
 
 
 def test_a_run_compiles_nothing_more(tmp_path) -> None:

@@ -1,14 +1,9 @@
 """Operations in one pass give what torch gives."""
 
-# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
-
 import pytest
-
-torch = pytest.importorskip("torch")
+import torch
 
 from network.cpu import fused_ops as fused
-
-pytestmark = pytest.mark.neural
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])

@@ -1,19 +1,13 @@
 """A convolution without upsampling gives what plain operations give on upsampled features."""
 
-# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
-
 import pytest
-
-torch = pytest.importorskip("torch")
-
+import torch
 from torch.nn import functional
 
 from network import unet
 from network.bfloat16 import round_taps
 from network.cpu.upsample_conv import can_upsample, convolve_upsampled, merge_taps
 from network.unet import Stage
-
-pytestmark = pytest.mark.neural
 
 
 def features(size: tuple[int, int], batch: int = 2) -> tuple[torch.Tensor, torch.Tensor]:

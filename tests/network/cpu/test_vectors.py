@@ -4,16 +4,10 @@ import math
 from typing import Any
 
 import numpy as np
-import pytest
-
-pytest.importorskip("torch")
-
 from numba import njit, types
 from numba.extending import intrinsic
 
 from network.cpu.vectors import COLUMNS, LANES, ROWS, Code, multiply_block
-
-pytestmark = pytest.mark.neural
 
 
 @intrinsic

@@ -1,19 +1,13 @@
 """A convolution by values at points gives the sum of products."""
 
-# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
-
 import pytest
-
-torch = pytest.importorskip("torch")
-
+import torch
 from torch.nn import functional
 
 from loops.parallel import limit_loops, thread_count
 from network.cpu import winograd
 from network.cpu.convolution import convolve
 from network.cpu.winograd import can_transform, convolve_transformed
-
-pytestmark = pytest.mark.neural
 
 
 def layers(size: tuple[int, int], channels: int, outputs: int, taps: int = 3, batch: int = 1) -> list[torch.Tensor]:

@@ -1,17 +1,11 @@
 """The blocks of the paper's networks."""
 
-# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
-
 import pytest
-
-torch = pytest.importorskip("torch")
-
+import torch
 from torch.nn import functional
 
 from network.paper.blocks import ResidualBlock, RobustAverage, TemporalModule
 from network.robust_average import outermost_first
-
-pytestmark = pytest.mark.neural
 
 
 def random(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> torch.Tensor:

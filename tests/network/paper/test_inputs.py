@@ -1,14 +1,8 @@
 """The network's inputs from a window."""
 
-# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
-
-import pytest
-
-torch = pytest.importorskip("torch")
+import torch
 
 from network.paper.inputs import KernelWindow, network_inputs
-
-pytestmark = pytest.mark.neural
 
 
 def uniform(*shape: int, seed: int = 0) -> torch.Tensor:

@@ -1,13 +1,10 @@
 """Thresholded kernels, and applying them."""
 
-# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
-
 import itertools
 import math
 
 import pytest
-
-torch = pytest.importorskip("torch")
+import torch
 
 import network.paper.kernels
 from network.paper.kernels import (
@@ -19,8 +16,6 @@ from network.paper.kernels import (
     softmax_kernel,
     threshold_kernel,
 )
-
-pytestmark = pytest.mark.neural
 
 
 def uniform(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> torch.Tensor:

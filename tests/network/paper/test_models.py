@@ -1,12 +1,9 @@
 """The networks: what goes in, which kernels come out, and what connects the frames."""
 
-# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
-
 from dataclasses import replace
 
 import pytest
-
-torch = pytest.importorskip("torch")
+import torch
 
 from network.paper.inputs import KernelWindow, network_inputs
 from network.paper.kernels import apply_kernels, mean_of
@@ -25,8 +22,6 @@ from network.paper.models import (
     for_inference,
 )
 from network.presets import build_preset
-
-pytestmark = pytest.mark.neural
 
 SMALL = KernelConfig(frames=3, size=3, activation="softmax")
 

@@ -1,15 +1,10 @@
 """The robust average of the paper."""
 
-# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
-
 import pytest
-
-torch = pytest.importorskip("torch")
+import torch
 
 from network.paper.ravg import ravg
 from tests.network.paper.test_blocks import random, ravg_by_sorting
-
-pytestmark = pytest.mark.neural
 
 
 @pytest.mark.parametrize("count", [3, 4, 5, 6, 7])

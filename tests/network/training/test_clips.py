@@ -1,7 +1,5 @@
 """Training clips on disk, which targets they allow, and the samples drawn from them."""
 
-# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
-
 import os
 import stat
 from dataclasses import fields, replace
@@ -9,9 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-torch = pytest.importorskip("torch")
-
+import torch
 from safetensors.torch import save_file
 from torch.utils.data import DataLoader
 
@@ -30,8 +26,6 @@ from network.training.clips import (
     write_shards,
 )
 from network.training.config import SamplerConfig
-
-pytestmark = pytest.mark.neural
 
 #: Nothing random but the clip, the level, the target and the orientation.
 PLAIN = SamplerConfig(crop=16, sets=1, fireflies=0, exposure_stops=0)

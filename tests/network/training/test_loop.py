@@ -1,7 +1,5 @@
 """Training, resuming it, and the files it leaves."""
 
-# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
-
 import math
 import os
 import signal
@@ -12,9 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-torch = pytest.importorskip("torch")
-
+import torch
 
 import network.training.loop
 from network.checkpoint import load_model
@@ -27,8 +23,6 @@ from network.training.config import LOSSES, TERMS, SamplerConfig, TrainConfig
 from network.training.loop import batch_loss, image_loss, predict, train, validate
 from network.training.perceptual import VGG19, Perceptual
 from tests.network.small import MODELS, make_model, make_robust, notes_of
-
-pytestmark = pytest.mark.neural
 
 
 def make_clip(seed: int, clean_target: bool = False, size: int = 40, sharp: bool = False) -> Clip:

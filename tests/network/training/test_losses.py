@@ -1,12 +1,9 @@
 """Image losses, their bias under noise, and their conversion from space to time."""
 
-# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
-
 import math
 
 import pytest
-
-torch = pytest.importorskip("torch")
+import torch
 
 from network.paper.kernels import Filtered, apply_kernels, mean_of, predict_kernel
 from network.training.losses import (
@@ -24,8 +21,6 @@ from network.training.losses import (
     temporal_terms,
     tone_mapped_psnr,
 )
-
-pytestmark = pytest.mark.neural
 
 LOSSES = [l1, smape, relmse, display]
 

@@ -1,20 +1,14 @@
 """VGG19 in torchvision's format, and the perceptual loss on it."""
 
-# ruff: noqa: E402 - nothing of network can be imported before it is known that torch is there
-
 from pathlib import Path
 
 import pytest
-
-torch = pytest.importorskip("torch")
-
+import torch
 from safetensors.torch import save_file
 from torch.nn import functional
 
 from network.training.losses import smape
 from network.training.perceptual import Perceptual, load_vgg19
-
-pytestmark = pytest.mark.neural
 
 #: Convolutions of torchvision's vgg19().features: index in the sequence, channels in and out.
 CONVOLUTIONS = {
