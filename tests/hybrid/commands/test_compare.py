@@ -14,9 +14,11 @@ from hybrid.comparison.methods import METHODS
 from hybrid.comparison.metrics import psnr
 from hybrid.comparison.results import Comparison, read_comparison
 from hybrid.files.shots import open_matching_sequence, open_shot
+from tests.hybrid.comparison.shots import use_this_process
 from tests.scenes import Scene, grained
 
 SMALL = Scene(height=24, width=32, frames=2)
+here = pytest.fixture(use_this_process, autouse=True)
 
 
 @pytest.fixture

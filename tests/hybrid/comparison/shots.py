@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from flow.motion import CYCLES
@@ -57,6 +58,13 @@ def make_shots(numbers: tuple[int, ...] = (4, 5, 6)) -> tuple[MemoryShot, Memory
 def perfect(shot: MemoryShot) -> Iterator[tuple[int, Array]]:
     for number in shot.numbers:
         yield number, shot.read(number).albedo
+
+
+def use_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run in this process what a comparison runs in processes of their own, which take longer to start than to work."""
+    for module in ("comparison.compare", "comparison.running", "commands.compare"):
+        name = f"hybrid.{module}.run_in_process"
+        monkeypatch.setattr(name, lambda function, *given, **named: function(*given, **named))
 
 
 def ways(**runs: Run) -> dict[str, Method]:

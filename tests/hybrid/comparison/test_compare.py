@@ -14,13 +14,16 @@ from hybrid.comparison.methods import Method, external, noisy
 from hybrid.comparison.metrics import mean_bias, psnr, relmse
 from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, MAP_TITLES, REFERENCE, FrameStore
 from hybrid.files.frame import Frame
-from tests.hybrid.comparison.shots import NOISY, SIZE, MemoryShot, make_shots, perfect, ways
+from tests.hybrid.comparison.shots import NOISY, SIZE, MemoryShot, make_shots, perfect, use_this_process, ways
 from tests.hybrid.comparison.test_running import killed, not_installed
+
+here = pytest.fixture(use_this_process, autouse=True)
 
 # Methods, at module level: they run in another process.
 
 
-def test_every_method_gets_its_figures_or_its_reason(tmp_path: Path) -> None:
+def test_every_method_gets_its_figures_or_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()  # in processes of their own: one dies
     shot, reference = make_shots()
     methods = NOISY | ways(perfect=perfect, gone=not_installed, dead=killed, again=noisy)
     results = {r.name: r for r in compare_shot(shot, reference, methods, folder=tmp_path).results}

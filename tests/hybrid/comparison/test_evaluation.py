@@ -15,7 +15,9 @@ from hybrid.comparison.flip import flip_maps
 from hybrid.comparison.methods import external
 from hybrid.comparison.store import CHANGE_MAP, FLIP_MAP, FrameStore
 from hybrid.files.frame import Frame
-from tests.hybrid.comparison.shots import NOISY, SIZE, Array, MemoryShot, make_shots, perfect, ways
+from tests.hybrid.comparison.shots import NOISY, SIZE, Array, MemoryShot, make_shots, perfect, use_this_process, ways
+
+here = pytest.fixture(use_this_process, autouse=True)
 
 
 def test_worth_in_samples_follows_the_levels() -> None:

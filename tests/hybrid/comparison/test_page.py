@@ -77,9 +77,14 @@ def write(folder: Path, name: str) -> Outline:
     return Outline(text)
 
 
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Outline:
+    return write(tmp_path_factory.mktemp("plain"), "a name")
+
+
 @pytest.mark.parametrize("name", HOSTILE)
-def test_a_name_makes_no_element_and_no_attribute(tmp_path: Path, name: str) -> None:
-    plain, hostile = write(tmp_path / "plain", "a name"), write(tmp_path / "hostile", name)
+def test_a_name_makes_no_element_and_no_attribute(plain: Outline, tmp_path: Path, name: str) -> None:
+    hostile = write(tmp_path, name)
     assert len(plain.elements) > 200
     # Lines of the chart lead to names that find no place beside their points.
     drawn = "path", "g", "defs", "use"
