@@ -138,7 +138,7 @@ def test_tiles_without_noise_are_left_as_they_are(tmp_path, weights):
 
     scene = Scene(height=40, width=320, frames=5)  # wide enough for tiles whose halo holds no edge
     shot = open_shot(scene.write(tmp_path, edit=blank))
-    denoiser = open_network(weights, tile=16, precision="float32")
+    denoiser = open_network(weights, tile=64, precision="float32")
     aligners = [FrameStream(shot, only(STAGES | extra), first_pass=Classical(DRAFT)) for extra in (set(), {"skip"})]
     images = [denoiser(aligner.align(SCENE.first + 2)).color for aligner in aligners]
     # Lit pixels are mirrored by 32 pixels. A trunk leaves next to nothing where there is nothing: 0.002 beside an edge.

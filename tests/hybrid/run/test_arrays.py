@@ -12,6 +12,7 @@ from hybrid.files.shots import open_shot
 from hybrid.run import arrays
 from hybrid.run.job import validate_views
 from tests.scenes import Scene
+from tests.seldom import seldom
 
 SCENE = Scene(frames=5)
 
@@ -45,7 +46,7 @@ def test_they_are_the_frames_of_files(shot, tmp_path, options):
 
 
 @pytest.mark.neural
-@pytest.mark.parametrize("strength", [0.0, 0.25])
+@pytest.mark.parametrize("strength", [0.25, *seldom(0.0)])
 def test_a_share_of_the_noise_stays_in_all_layers(strength):
     """Parts add up to the color as before, and what was not rendered is repaired all the same."""
     random = np.random.default_rng(1)
