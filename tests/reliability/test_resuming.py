@@ -11,13 +11,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.commands import ROOT, Done, ravg, run_python
+from tests.commands import ROOT, ravg, run_python
 from tests.reliability.shots import (
     ALBEDO,
     DRAFT,
@@ -43,85 +42,6 @@ from tests.reliability.shots import (
 )
 
 pytestmark = [pytest.mark.reliability, pytest.mark.posix]
-
-
-def later() -> float:
-    return time.time() + 5
-
-
-# --- 6: --resume makes again what would be another
-
-
-@dataclass(frozen=True)
-class Project:
-    """A shot with estimates, and pictures made of them."""
-
-    folder: Path
-
-    @property
-    def frames(self) -> Path:
-        return self.folder / "in"
-
-    @property
-    def first_pass(self) -> Path:
-        return self.folder / "single"
-
-    @property
-    def out(self) -> Path:
-        return self.folder / "out"
-
-    def frame(self, number: int) -> Path:
-        return self.frames / f"shot.{number}.exr"
-
-    def write(self, frames: int) -> None:
-        shot(self.frames, frames, step=(2, 1), **RAW)
-        blurred(self.first_pass, self.frames)
-
-    def run(self, out: Path, *more: object) -> Done:
-        return ravg("denoise", self.frames, "-o", out, *DRAFT, "--first-pass", self.first_pass, *more).succeeds()
-
-    def resumes_as_fresh(self, *more: object) -> None:
-        """Assert that --resume leaves what a run into an empty folder makes."""
-        self.run(self.out, "--resume", *more)
-        self.run(self.folder / "fresh", *more)
-        same(self.folder / "fresh", self.out)
-
-
-CHANGES: dict[str, Callable[[Project], object]] = {
-    "the last frame rendered again, of the same time": lambda p: render_again(p.frame(1008)),
-    "two frames swapped": lambda p: exchange(p.frame(1003), p.frame(1006)),
-    "noisy frames as estimates": lambda p: [shutil.copy2(x, p.first_pass / x.name) for x in p.frames.iterdir()],
-    "an empty output": lambda p: os.truncate(p.out / "shot.1004.exr", 0),
-    "an output that is an input": lambda p: shutil.copy2(p.frame(1004), p.out / "shot.1004.exr"),
-}
-
-
-@cases(CHANGES, "change")
-def test_resume_after_a_change(folder, change):
-    project = Project(folder)
-    project.write(8)
-    project.run(project.out)
-    change(project)
-    project.resumes_as_fresh()
-
-
-OPTIONS: dict[str, Sequence[str]] = {
-    "a layer left out": ("--layer", "normal=Denoising Albedo"),
-    "a stage forced on": ("--stages", "refine"),
-    "a stage forced off": ("--no-stages", "gate"),
-    "another preset": ("--preset", "final", "--first-pass", "none"),
-    "no estimates": ("--first-pass", "none"),
-    "our own estimates": ("--first-pass", "nlm"),
-    "OIDN's estimates": ("--first-pass", "oidn-fast"),
-}
-
-
-@cases(OPTIONS, "more")
-def test_resume_with_other_options(folder, more):
-    project = Project(folder)
-    project.write(8)
-    project.run(project.out)
-    project.resumes_as_fresh(*more)
 
 
 # --- 7: kept estimates are those that would be made
@@ -153,7 +73,7 @@ def test_kept_estimates_after_a_change(folder, change):
     kept(folder, FAST, FAST, change)
 
 
-# --- 15: resuming with another option, profile, layer or weights
+# --- 6, 15: --resume makes again what would be another: with another file, option, profile, layer or weights
 
 MINE = """
 [layers]
@@ -185,7 +105,7 @@ def as_fresh(
     edit: Edit | None = None,
 ) -> None:
     """Assert that after a change --resume leaves the frames of a run into an empty folder."""
-    shot(folder / "in", 6, edit, step=(2, 1), **RAW)
+    blurred(folder / "single", shot(folder / "in", 6, edit, step=(2, 1), **RAW))
     write_albedo(folder / "albedo")
     (folder / "mine.toml").write_text(MINE)
     weights(folder, ROOT)
@@ -204,7 +124,20 @@ def renumber(folder: Path) -> None:
 Other = tuple[Sequence[str], Sequence[str], Callable[[Path], object]]
 ELSEWHERE = ["--layer", "albedo=albedo/####.exr"]
 PROFILE = ["--profile", "mine.toml"]
+ESTIMATES = ["--first-pass", "single"]
 OTHERS: dict[str, Other] = {
+    "the last frame rendered again, of the same time": ([], [], lambda f: render_again(f / "in/shot.1006.exr")),
+    "two frames swapped": ([], [], lambda f: exchange(f / "in/shot.1003.exr", f / "in/shot.1006.exr")),
+    "noisy frames as estimates": (ESTIMATES, ESTIMATES, lambda f: [shutil.copy2(x, f / "single") for x in (f / "in").iterdir()]),
+    "an empty output": ([], [], lambda f: os.truncate(f / "out/shot.1004.exr", 0)),
+    "an output that is an input": ([], [], lambda f: shutil.copy2(f / "in/shot.1004.exr", f / "out")),
+    "a layer left out": (ESTIMATES, [*ESTIMATES, "--layer", "normal=Denoising Albedo"], nothing),
+    "a stage forced on": (ESTIMATES, [*ESTIMATES, "--stages", "refine"], nothing),
+    "a stage forced off": (ESTIMATES, [*ESTIMATES, "--no-stages", "gate"], nothing),
+    "another preset": (ESTIMATES, ["--preset", "final", "--first-pass", "none"], nothing),
+    "no estimates": (ESTIMATES, ["--first-pass", "none"], nothing),
+    "our own estimates": (ESTIMATES, ["--first-pass", "nlm"], nothing),
+    "OIDN's estimates": (ESTIMATES, ["--first-pass", "oidn-fast"], nothing),
     "--motion next": ([], ["--motion", "next,y-up"], nothing),
     "--motion, another scale": (["--motion", "both,y-up"], ["--motion", "both,y-up,scale=2"], nothing),
     "a profile instead of none": ([], PROFILE, nothing),
