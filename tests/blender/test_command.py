@@ -1,6 +1,5 @@
 """The extension's side of the process that it starts; needs no Blender."""
 
-import importlib.util
 import os
 import stat
 import sys
@@ -9,12 +8,9 @@ from pathlib import Path
 
 import pytest
 
-SOURCE = Path(__file__).parents[2] / "blender" / "command.py"
-spec = importlib.util.spec_from_file_location("ravg_blender_command", SOURCE)
-assert spec is not None
-assert spec.loader is not None
-command = importlib.util.module_from_spec(spec)  # the package around it imports bpy
-spec.loader.exec_module(command)
+from tests.blender.wheels import load_module
+
+command = load_module("command")
 
 
 def run(code: str, tmp_path: Path, outputs: list[Path] | None = None) -> command.Run:

@@ -1,18 +1,14 @@
 """Which rendered frames are noisy renders, read from their headers; needs no Blender."""
 
-import importlib.util
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
 import pytest
 
-SOURCE = Path(__file__).parents[2] / "blender" / "frames.py"
-spec = importlib.util.spec_from_file_location("ravg_blender_frames", SOURCE)
-assert spec is not None
-assert spec.loader is not None
-frames = importlib.util.module_from_spec(spec)  # the package around it imports bpy
-spec.loader.exec_module(frames)
+from tests.blender.wheels import load_module
+
+frames = load_module("frames")
 
 PASSES = {"Combined": "RGBA", "Denoising Albedo": "RGB", "Denoising Normal": "XYZ"}
 

@@ -1,6 +1,5 @@
 """How ravg is installed for Blender, without installing it; needs no Blender."""
 
-import importlib.util
 import os
 import subprocess
 import sys
@@ -8,15 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.blender.wheels import write_wheel
+from tests.blender.wheels import load_module, write_wheel
 
-SOURCE = Path(__file__).parents[2] / "blender" / "install.py"
-spec = importlib.util.spec_from_file_location("ravg_blender_install", SOURCE)
-assert spec is not None
-assert spec.loader is not None
-install = importlib.util.module_from_spec(spec)  # the package around it imports bpy
-sys.modules[spec.name] = install  # dataclasses look it up
-spec.loader.exec_module(install)
+install = load_module("install")
 
 
 def environment(home: Path, name: str) -> Path:

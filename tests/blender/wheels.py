@@ -1,7 +1,12 @@
-"""Wheels that hold next to nothing, for the tests of installing."""
+"""Modules of the extension, and wheels that hold next to nothing, for tests without Blender."""
 
+import importlib.util
+import sys
 import zipfile
 from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
 
 
 def write_wheel(folder: Path, name: str, version: str, code: str, extra: str = "") -> Path:
@@ -18,3 +23,13 @@ def write_wheel(folder: Path, name: str, version: str, code: str, extra: str = "
             archive.writestr(inside, text)
         archive.writestr(f"{info}/RECORD", "".join(f"{inside},,\n" for inside in [*files, f"{info}/RECORD"]))
     return path
+
+
+def load_module(name: str) -> Any:
+    """A module of the extension that needs no Blender, without the package around it, which imports bpy."""
+    spec = importlib.util.spec_from_file_location(f"ravg_blender_{name}", ROOT / "blender" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)  # dataclasses look it up
+    spec.loader.exec_module(module)
+    return module
