@@ -1,5 +1,3 @@
-"""Motion vectors: a real render's convention, composing, inverting."""
-
 from pathlib import Path
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Which of several flows explains the pictures, pixel by pixel."""
-
 import numpy as np
 import pytest
 

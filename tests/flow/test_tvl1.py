@@ -1,5 +1,3 @@
-"""Refining flows: exact vectors stay, wrong ones are mended, nothing breaks."""
-
 import cv2
 import numpy as np
 import pytest

@@ -1,5 +1,3 @@
-"""Warping: identity, whole pixels, exact weights, borders, fireflies."""
-
 import cv2
 import numpy as np
 import pytest

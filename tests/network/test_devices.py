@@ -1,5 +1,3 @@
-"""Devices of torch have OIDN's names."""
-
 import pytest
 import torch
 

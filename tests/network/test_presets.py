@@ -1,5 +1,3 @@
-"""Networks by name."""
-
 import pytest
 import torch
 

@@ -1,5 +1,3 @@
-"""The Robust Average block on images."""
-
 import numpy as np
 import pytest
 import torch

@@ -1,5 +1,3 @@
-"""Curves, and their inverses."""
-
 import torch
 
 from network.transfer import clip, pu_forward, pu_inverse, srgb_forward, srgb_inverse

@@ -1,5 +1,3 @@
-"""Means over cells, and the values between them."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""Parts of the light, which add up before and after."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""Windows as they are aligned: estimates, parts of a frame, frames that are missing."""
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Where the pixels of one frame are in another: the renderer's vectors, and what corrects them."""
-
 import numpy as np
 import pytest
 

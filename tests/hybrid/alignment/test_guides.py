@@ -1,5 +1,3 @@
-"""Guides of a window, averaged where it moves by whole pixels."""
-
 import numpy as np
 
 from hybrid.alignment.align import align

@@ -1,5 +1,3 @@
-"""The confidence in the pixels of a neighbour, by its motion and by its light."""
-
 import numpy as np
 
 from hybrid.alignment.neighbour import AGREEING, combine_confidence, novelty_of

@@ -1,5 +1,3 @@
-"""Noise of a neighbour at the pixels of the centre."""
-
 import numpy as np
 import pytest
 

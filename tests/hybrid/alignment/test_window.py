@@ -1,5 +1,3 @@
-"""A window of aligned frames: the centre in the place of missing ones, guides of all frames."""
-
 from dataclasses import replace
 
 import numpy as np

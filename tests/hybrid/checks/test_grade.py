@@ -1,5 +1,3 @@
-"""The level of denoised pictures against that of their samples."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""Chunks of a shot in processes on this machine."""
-
 import os
 import re
 import signal

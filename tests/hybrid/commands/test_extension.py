@@ -1,5 +1,3 @@
-"""`ravg blender-extension`: the file that Blender installs."""
-
 import tomllib
 import zipfile
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""How commands open a shot."""
-
 from dataclasses import dataclass
 from pathlib import Path
 

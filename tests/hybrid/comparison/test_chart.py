@@ -1,5 +1,3 @@
-"""The chart: axes, labels, markers and lines, as SVG and as PNG."""
-
 # ruff: noqa: E402 - skipped by name without the extra `compare`
 
 import math

@@ -1,5 +1,3 @@
-"""Frames that methods have left: measured against the reference, in space and in time."""
-
 from dataclasses import replace
 from pathlib import Path
 from threading import Barrier

@@ -1,5 +1,3 @@
-"""Results of a comparison: the best and ties, the front, stages, several shots, and all of it as JSON."""
-
 import json
 import math
 from dataclasses import replace

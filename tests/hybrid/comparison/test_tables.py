@@ -1,5 +1,3 @@
-"""Results as text: numbers, and tables for a terminal and for Markdown."""
-
 import io
 import math
 from dataclasses import replace

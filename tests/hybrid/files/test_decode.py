@@ -1,5 +1,3 @@
-"""Layers of files as arrays of a frame."""
-
 from pathlib import Path
 
 import numpy as np

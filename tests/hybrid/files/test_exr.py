@@ -1,5 +1,3 @@
-"""Reading, finding and writing layers of OpenEXR files."""
-
 import os
 import socket
 from fractions import Fraction

@@ -1,5 +1,3 @@
-"""Arrays of a frame."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""The layers of a shot, in one of its frames."""
-
 import numpy as np
 
 from hybrid.files.passes import BEAUTY, Passes, Sum

@@ -1,5 +1,3 @@
-"""Frames that are read ahead."""
-
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor

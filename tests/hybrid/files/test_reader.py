@@ -1,5 +1,3 @@
-"""Reading the frames of a shot."""
-
 import shutil
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Sequence names as people paste them."""
-
 from pathlib import Path
 
 import pytest

@@ -1,5 +1,3 @@
-"""Shots, the frames around a frame, and the names of files."""
-
 import re
 from pathlib import Path
 

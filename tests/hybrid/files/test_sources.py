@@ -1,5 +1,3 @@
-"""The sources of a picture, and why it is made again."""
-
 import json
 import os
 from pathlib import Path

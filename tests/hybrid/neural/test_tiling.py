@@ -1,5 +1,3 @@
-"""Pictures, tensors and tiles."""
-
 import numpy as np
 import pytest
 

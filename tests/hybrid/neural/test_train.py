@@ -1,5 +1,3 @@
-"""Weights that trainings begin with."""
-
 import importlib.util
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""The preset that fits a time per frame."""
-
 import time
 from dataclasses import replace
 

@@ -1,5 +1,3 @@
-"""Records of runs, and what they say together."""
-
 import json
 import os
 import platform

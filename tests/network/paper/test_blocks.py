@@ -1,5 +1,3 @@
-"""The blocks of the paper's networks."""
-
 import pytest
 import torch
 from torch.nn import functional

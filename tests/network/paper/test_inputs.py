@@ -1,5 +1,3 @@
-"""The network's inputs from a window."""
-
 import torch
 
 from network.paper.inputs import KernelWindow, network_inputs

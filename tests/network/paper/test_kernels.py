@@ -1,5 +1,3 @@
-"""Thresholded kernels, and applying them."""
-
 import itertools
 import math
 

@@ -1,5 +1,3 @@
-"""The robust average of the paper."""
-
 import pytest
 import torch
 

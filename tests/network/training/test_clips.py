@@ -1,5 +1,3 @@
-"""Training clips on disk, which targets they allow, and the samples drawn from them."""
-
 import os
 import stat
 from dataclasses import fields, replace

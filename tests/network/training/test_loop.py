@@ -1,5 +1,3 @@
-"""Training, resuming it, and the files it leaves."""
-
 import math
 import os
 import signal

@@ -1,5 +1,3 @@
-"""Image losses, their bias under noise, and their conversion from space to time."""
-
 import math
 
 import pytest

@@ -1,5 +1,3 @@
-"""VGG19 in torchvision's format, and the perceptual loss on it."""
-
 from pathlib import Path
 
 import pytest
