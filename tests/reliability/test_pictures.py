@@ -35,7 +35,6 @@ from tests.reliability.shots import (
     read_layers,
     same,
     shot,
-    wall,
     write,
 )
 
@@ -46,40 +45,9 @@ pytestmark = [pytest.mark.reliability, pytest.mark.posix]
 ODD = 6
 
 
-def flare(factor: float, part: slice = slice(None)) -> Edit:
-    def edit(index: int, layers: Layers) -> None:
-        layers[COLOR][part] *= factor if index == ODD else 1
-
-    return edit
-
-
-def switch(factor: float) -> Edit:
-    def edit(index: int, layers: Layers) -> None:
-        layers[COLOR] *= np.float32(factor if index >= ODD else 1)
-
-    return edit
-
-
-def burst(index: int, layers: Layers) -> None:
-    """From frame 7 to 9 the wall slides by three pixels per frame."""
-    layers |= wall(min(max(index - ODD, 0), 3), (3, 0))
-    layers[VECTOR][:] = 0
-    layers[VECTOR][..., 0] = -3 if ODD < index <= ODD + 3 else 0
-    layers[VECTOR][..., 2] = -3 if ODD <= index < ODD + 3 else 0
-
-
 def cut(index: int, layers: Layers) -> None:
     for name in (COLOR, ALBEDO) if index >= ODD else ():
         layers[name] = np.ascontiguousarray(layers[name][::-1, ::-1])
-
-
-def sparks(count: int, value: float = 5000) -> Edit:
-    def late(index: int, layers: Layers) -> None:
-        if index == ODD:
-            places = np.random.default_rng(count).integers(4, (SIZE[0] - 4, SIZE[1] - 4), (count, 2))
-            layers[COLOR][places[:, 0], places[:, 1]] = value
-
-    return late
 
 
 def spread(index: int, layers: Layers) -> None:
@@ -87,25 +55,6 @@ def spread(index: int, layers: Layers) -> None:
     taps = np.array([0.2, 1, 0.2]) / 1.4
     for name in (COLOR, ALBEDO, NORMAL):
         layers[name] = cv2.sepFilter2D(layers[name], -1, taps, taps, borderType=cv2.BORDER_REFLECT_101)
-
-
-# Event → changes before and after noise.
-EVENTS: dict[str, tuple[Edit | None, Edit | None]] = {
-    "a frame five times brighter": (flare(5), None),
-    "a light switched down": (switch(0.2), None),
-    "half of a frame four times brighter": (flare(4, slice(0, SIZE[0] // 2)), None),
-    "a burst of motion": (burst, None),
-    "a cut": (cut, None),
-    "five fireflies": (None, sparks(5, 800)),
-}
-
-
-@cases(EVENTS, "event")
-def test_a_frame_is_the_same_in_chunks(folder, event):
-    noisy = shot(folder / "in", 18, *event)
-    for out, frames in (("all", "1001-1018"), ("part", "1005-1007"), ("part", "1008")):
-        ravg("denoise", noisy, "-o", folder / out, *DRAFT, "--frames", frames).succeeds()
-    same(folder / "part", folder / "all")
 
 
 @cases({"throughout": None, "with a cut": cut}, "event")
