@@ -2,7 +2,6 @@
 
 import json
 import os
-import socket
 import subprocess
 import sys
 import urllib.request
@@ -32,31 +31,6 @@ def test_an_aov_that_is_a_role_changes_nothing_else(folder, name):
 
 
 # --- 12: no crash, no hang: one line
-
-
-def make_special(kind: str, path: Path) -> None:
-    if kind == "pipe":
-        os.mkfifo(path)
-    elif kind == "socket":
-        with socket.socket(socket.AF_UNIX) as server:
-            server.bind(str(path))
-    elif kind == "device":
-        os.mknod(path, 0o020666, os.makedev(1, 5))  # /dev/zero: without end
-    elif kind == "loop":
-        path.symlink_to(path)
-    else:
-        path.mkdir()
-
-
-@cases((["inspect", "in"], draft()), "words")
-@cases(("pipe", "socket", "device", "loop", "folder"), "kind")
-def test_no_frame_that_is_no_file_is_waited_for(folder, kind, words):
-    path = shot(folder / "in", 5) / "shot.1003.exr"
-    path.unlink()
-    make_special(kind, path)
-    done = ravg(*words, folder=folder, seconds=60)
-    assert done.code != -9
-    assert "Traceback" not in done.said
 
 
 LOOPS = ["inspect", "a"], ["denoise", "in", "-o", "a/x"], draft("--preview", "a/x.png")

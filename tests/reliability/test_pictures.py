@@ -84,23 +84,6 @@ def covered(hole: Callable[[int], bool], share: float = 0.0) -> Edit:
     return edit
 
 
-HOLES = {"every frame": lambda i: True, "the first": lambda i: i == 0, "a later one": lambda i: i == 3}
-
-
-@pytest.mark.neural
-@cases((0.0, 0.5), "share")
-@cases(HOLES, "hole")
-def test_opaque_pixels_stay_opaque(folder, hole, share):
-    shot(folder / "in", 5, covered(hole, share), step=(2, 0))
-    ravg("denoise", "in", "-o", "out", "--first-pass", "nlm", folder=folder).succeeds()
-    for name in names(folder / "out"):
-        before, after = (read(folder / where / name)[f"{COLOR}.A"] for where in ("in", "out"))
-        inside = cv2.erode((before == 1).astype(np.uint8), np.ones((5, 5), np.uint8)) == 1
-        assert (after[inside] == 1).all()
-        assert after.min() >= -1e-6
-        assert after.max() <= 1 + 1e-6
-
-
 @pytest.mark.neural
 def test_alpha_is_denoised_where_some_frame_has_a_hole(folder):
     """Whatever the first frame has."""
@@ -144,20 +127,6 @@ def test_a_spark_leaves_no_ring(folder, value, estimate, count):
             block = slice(y - 4, y + 5), slice(x - 6, x + 7)
             assert made[block].mean() / plain[block].mean() <= 1.1
             assert made[block].max() / plain[block].max() <= 1.5
-
-
-@cases((50.0, 5000.0), "value")
-@cases(((0, 0), (2, 1)), "step")
-def test_a_lamp_of_one_pixel_stays(folder, step, value):
-    def late(index: int, layers: Layers) -> None:
-        layers[COLOR][16 + step[1] * index, 20 + step[0] * index] = value
-
-    shot(folder / "in", 5, late=late, step=step)
-    ravg(*draft("--first-pass", "oidn"), folder=folder).succeeds()
-    for index in range(5):
-        y, x = 16 + step[1] * index, 20 + step[0] * index
-        block = color(folder / "out" / f"shot.{1001 + index}.exr")[y - 3 : y + 4, x - 3 : x + 4]
-        assert 0.5 * value < block.mean(axis=-1).sum() < 2 * value
 
 
 # --- 21: a frame that is not like the others

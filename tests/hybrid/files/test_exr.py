@@ -1,5 +1,4 @@
 import os
-import socket
 from fractions import Fraction
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from hybrid.files.exr import ExrError, read_exr, write_exr
 from hybrid.files.layers import find_layers
 from hybrid.files.sources import identify
 from tests.exr_files import write_layers
+from tests.hybrid.files.test_replace import make
 
 CYCLES = {
     "Combined": "RGBA",
@@ -52,15 +52,14 @@ def cycles_names(layers=CYCLES, prefix="ViewLayer.") -> list[str]:
 
 
 @pytest.mark.posix
-@pytest.mark.parametrize("kind", ["pipe", "socket"])
+@pytest.mark.parametrize("kind", ["pipe", "socket", "device", "folder"])
 @pytest.mark.parametrize("look", [read_exr, identify])
-def test_what_is_no_file_is_not_waited_for(tmp_path, kind, look):
+def test_what_is_no_file_is_not_waited_for(tmp_path, kind, look, monkeypatch):
     """A pipe among the frames was read until somebody wrote to it: for ever."""
-    path = tmp_path / "a.exr"
-    with socket.socket(socket.AF_UNIX) as server:
-        os.mkfifo(path) if kind == "pipe" else server.bind(os.path.relpath(path))
-        with pytest.raises(OSError, match=f"a.exr is a {kind}, expected a file"):
-            look(path)
+    monkeypatch.chdir(tmp_path)  # names of sockets are short
+    make(kind, Path("a.exr"))
+    with pytest.raises(OSError, match=f"a.exr is a {kind}, expected a file"):
+        look(Path("a.exr"))
 
 
 # --- reading
