@@ -15,6 +15,7 @@ from tests.renderers import RENDERERS, Renderer, truths
 from tests.seldom import seldom
 
 FRAMES = truths()
+ROLES = "albedo", "normal", "depth", "motion", "variance"
 
 
 def run(command: str, spec: Path, out: Path | None, *options: str) -> str:
@@ -64,7 +65,11 @@ ALIKE = "arnold, direction and length", "renderman, apart", "vray, prefixed", "3
 @pytest.mark.parametrize("name", [*(name for name in RENDERERS if name not in ALIKE), *seldom(*ALIKE)])
 def test_the_same_command_gives_the_same_picture(name: str, told, tmp_path: Path) -> None:
     renderer = RENDERERS[name]
-    found, said = denoised(renderer.write(tmp_path / "theirs", FRAMES), tmp_path / "found", *options(renderer), "-v")
+    spec = renderer.write(tmp_path / "theirs", FRAMES)
+    layers, expected = open_shot(spec).layers(10), {*renderer.roles.split()}
+    expected |= {"motion"} if renderer.direction != "none" else set()
+    assert {role for role in ROLES if getattr(layers, role) is not None} == expected
+    found, said = denoised(spec, tmp_path / "found", *options(renderer), "-v")
     assert "warning" not in said
     assert f"layers: {renderer.profile} (" in said
     # Vectors are rounded otherwise in other units.

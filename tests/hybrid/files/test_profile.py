@@ -42,6 +42,7 @@ def taken(layers: Layers) -> dict[str, str]:
     return {role: str(getattr(layers, role)) for role in ROLES if getattr(layers, role) is not None}
 
 
+# Files as each renderer writes them by default are in tests/renderers.py.
 @pytest.mark.parametrize(
     ("profile", "channels", "attributes", "expected"),
     [
@@ -50,61 +51,17 @@ def taken(layers: Layers) -> dict[str, str]:
             {"color": "V.Combined.RGB", "alpha": "V.Combined.A", "motion": "V.Vector.XYZW", "depth": "V.Depth.Z"},
         ),
         (
-            "Arnold", "RGBA Z N.XYZ denoise_albedo.RGB variance.Y motionvector.RGB", {"arnold__version": "7"},
-            {"color": "RGB", "alpha": "A", "depth": "Z", "normal": "N.XYZ", "albedo": "denoise_albedo.RGB",
-             "variance": "variance.Y", "motion": "motionvector.RGB"},
-        ),
-        (
-            "RenderMan", "Ci.rgb a mse.rgb sampleCount albedo.rgb normal.rgb forward.rgb backward.rgb zfiltered", {},
-            {"color": "Ci.rgb", "alpha": "a", "variance": "mse.rgb", "albedo": "albedo.rgb", "normal": "normal.rgb",
-             "motion": "backward.rgb", "motion_next": "forward.rgb", "depth": "zfiltered"},
-        ),
-        (
-            "V-Ray", "RGBA diffuseFilter.red diffuseFilter.green diffuseFilter.blue normals.X normals.Y normals.Z "
-            "zDepth velocity.RGB", {"vrayInfo__camera": "cam"},
-            {"color": "RGB", "alpha": "A", "albedo": "diffuseFilter.red,green,blue", "normal": "normals.XYZ",
-             "depth": "zDepth", "motion": "velocity.RGB"},
-        ),
-        (
             "V-Ray", "RGBA VRayDiffuseFilter.RGB VRayNormals.RGB VRayZDepth.Z VRayVelocity.RGB", {},
             {"color": "RGB", "alpha": "A", "albedo": "VRayDiffuseFilter.RGB", "normal": "VRayNormals.RGB",
              "depth": "VRayZDepth.Z", "motion": "VRayVelocity.RGB"},
-        ),
-        (
-            "Karma", "C.rgba N.xyz albedo.rgb hitPz motionvectors.xyz", {"husk:render_stats": "{}"},
-            {"color": "C.rgb", "alpha": "C.a", "normal": "N.xyz", "albedo": "albedo.rgb", "depth": "hitPz",
-             "motion": "motionvectors.xyz"},
-        ),
-        (
-            "Redshift", "RGBA DiffuseFilter.RGB Normals.RGB Z MotionVectors.RG", {},
-            {"color": "RGB", "alpha": "A", "albedo": "DiffuseFilter.RGB", "normal": "Normals.RGB", "depth": "Z",
-             "motion": "MotionVectors.RG"},
-        ),
-        (
-            "Mitsuba", "my_image.RGBA alb.RGB nn.XYZ dd.T", {},
-            {"color": "my_image.RGB", "alpha": "my_image.A", "albedo": "alb.RGB", "normal": "nn.XYZ", "depth": "dd.T"},
         ),
         (
             "pbrt", "RGB Albedo.RGB N.XYZ Ns.XYZ Variance.RGB RelativeVariance.RGB", {},
             {"color": "RGB", "albedo": "Albedo.RGB", "normal": "Ns.XYZ", "variance": "Variance.RGB"},
         ),
         (
-            "MoonRay", "RGBA albedo.RGB normal.XYZ depth motionvec.XY", {},
-            {"color": "RGB", "alpha": "A", "albedo": "albedo.RGB", "normal": "normal.XYZ", "depth": "depth",
-             "motion": "motionvec.XY"},
-        ),
-        (
-            "appleseed", "beauty.RGBA albedo.RGB shading_normal.RGB screen_space_velocity.RGB", {},
-            {"color": "beauty.RGB", "alpha": "beauty.A", "albedo": "albedo.RGB", "normal": "shading_normal.RGB",
-             "motion": "screen_space_velocity.RGB"},
-        ),
-        (
             "Unreal", "FinalImage.RGBA FinalImageMovieRenderQueue_WorldDepth.R", {},
             {"color": "FinalImage.RGB", "alpha": "FinalImage.A", "depth": "FinalImageMovieRenderQueue_WorldDepth.R"},
-        ),
-        (
-            "Nuke", "RGBA forward.uv backward.uv depth.Z", {"nuke__version": "15"},
-            {"color": "RGB", "alpha": "A", "motion": "backward.uv", "motion_next": "forward.uv", "depth": "depth.Z"},
         ),
         (
             "Arnold", "RGB denoise_albedo_noice.RGB N_noice.XYZ Z_noice motionvector.RG", {"arnold__version": "7"},
@@ -131,7 +88,7 @@ def taken(layers: Layers) -> dict[str, str]:
     ],
     ids=lambda value: value if isinstance(value, str) and len(value) < 15 else "",
 )  # fmt: skip
-def test_renderers_are_known_by_their_files(tmp_path, profile, channels, attributes, expected):
+def test_further_files_of_renderers_are_known(tmp_path, profile, channels, attributes, expected):
     layers = find_layers(image(tmp_path, channels, **attributes))
     assert layers.profile == profile
     assert taken(layers) == expected
