@@ -96,12 +96,12 @@ def with_damaged_frame(shot, folder):
 def test_a_chunk_fails_alone(shot, tmp_path, capsys):
     broken = with_damaged_frame(shot, tmp_path / "noisy")
     words = ["denoise", str(broken), "-o", str(tmp_path / "out"), *OPTIONS, "--no-stages", "stabilize"]
-    assert main([*words, "--jobs", "5"]) == 1
+    assert main([*words, "--frames", "1001,1005", "--jobs", "2"]) == 1
     said = capsys.readouterr().err
     assert re.search(r"error: 1005: .*shot\.1005\.exr: damaged", said)
     assert "ended with" not in said, "the error says why"
-    assert re.search(r"error: \d of 5 chunks failed: .*1005", said)
-    assert "shot.1001.exr" in contents(tmp_path / "out")
+    assert "error: 1 of 2 chunks failed: 1005" in said
+    assert [*contents(tmp_path / "out")] == ["shot.1001.exr"]
 
 
 def test_the_reasons_why_frames_failed_are_told_once(shot, tmp_path, capsys):
