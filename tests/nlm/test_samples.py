@@ -48,6 +48,16 @@ def window(truth: np.ndarray, noise: float, firefly: tuple[int, int] | None = No
     return own, average_neighbours(all_frames, None, confidence, confidence, np.ones_like(truth), own)
 
 
+def blend_smooth(
+    truth: np.ndarray, frames: np.ndarray, confidence: np.ndarray | None = None, exposure: float = 0.5
+) -> tuple[np.ndarray, np.ndarray]:
+    """A slightly blurred picture with the samples of frames blended in, and the blurred one."""
+    trust = np.ones(frames.shape[:3], np.float32) if confidence is None else confidence
+    sides = average_neighbours(frames, None, trust, trust, ONES, frames[2])
+    smooth = cv2.GaussianBlur(truth, (0, 0), 0.5)
+    return blend_samples(smooth, frames[2], sides, exposure), smooth
+
+
 def error(image: np.ndarray, truth: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(image - truth, dtype=np.float64))))
 
@@ -118,10 +128,7 @@ def test_lights_that_pass_over_the_neighbours_are_no_noise(noise: float) -> None
     rng = np.random.default_rng(15)
     for t in (0, 1, 3, 4):
         frames[t][rng.random(SHAPE) < 0.01] = 5
-    confidence = np.ones(frames.shape[:3], np.float32)
-    sides = average_neighbours(frames, None, confidence, confidence, ONES, frames[2])
-    smooth = cv2.GaussianBlur(truth, (0, 0), 0.5)
-    result = blend_samples(smooth, frames[2], sides, 0.5)
+    result, smooth = blend_smooth(truth, frames)
     assert error(result, truth) < error(frames[2], truth) + 0.02 * error(smooth, truth)
 
 
@@ -131,9 +138,7 @@ def test_light_that_changes_where_one_neighbour_shows_the_place_is_no_noise() ->
     frames = np.stack([noisy(truth * np.float32(1 + 0.02 * (t - 2)), 0.001, 10 + t) for t in range(5)])
     confidence = np.ones(frames.shape[:3], np.float32)
     confidence[[0, 1, 4], :, :2] = 0
-    sides = average_neighbours(frames, None, confidence, confidence, ONES, frames[2])
-    smooth = cv2.GaussianBlur(truth, (0, 0), 0.5)
-    result = blend_samples(smooth, frames[2], sides, 0.5)
+    result, _ = blend_smooth(truth, frames, confidence)
     assert error(result, truth) < 1.02 * error(frames[2], truth)
 
 
@@ -144,9 +149,7 @@ def test_lines_at_a_rim_that_no_frame_shows_are_no_noise_where_there_is_next_to_
     frames = np.stack([noisy(truth, noise, 10 + t) for t in range(5)])
     confidence = np.ones(frames.shape[:3], np.float32)
     confidence[[0, 1, 3, 4], :, :12] = 0
-    sides = average_neighbours(frames, None, confidence, confidence, ONES, frames[2])
-    smooth = cv2.GaussianBlur(truth, (0, 0), 0.5)
-    result = blend_samples(smooth, frames[2], sides, 0.5)
+    result, _ = blend_smooth(truth, frames, confidence)
     assert error(result, truth) < 1.02 * error(frames[2], truth) + 1e-5
 
 
@@ -159,9 +162,7 @@ def test_the_rim_of_an_object_on_black_is_no_noise(noise: float) -> None:
     frames = np.stack([noisy(truth, noise, 10 + t) for t in range(5)])
     known = cv2.erode(inside.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     confidence = np.broadcast_to(known.astype(np.float32), frames.shape[:3]).copy()
-    sides = average_neighbours(frames, None, confidence, confidence, ONES, frames[2])
-    smooth = cv2.GaussianBlur(truth, (0, 0), 0.5)
-    result = blend_samples(smooth, frames[2], sides, 0.1)
+    result, smooth = blend_smooth(truth, frames, confidence, 0.1)
     assert error(result, truth) < 1.02 * error(frames[2], truth) + 0.05 * error(smooth, truth)
 
 
