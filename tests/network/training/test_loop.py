@@ -21,6 +21,7 @@ from network.training.config import LOSSES, TERMS, SamplerConfig, TrainConfig
 from network.training.loop import batch_loss, image_loss, predict, train, validate
 from network.training.perceptual import VGG19, Perceptual
 from tests.network.small import MODELS, make_model, make_robust, notes_of
+from tests.seldom import seldom
 
 
 def make_clip(seed: int, clean_target: bool = False, size: int = 40, sharp: bool = False) -> Clip:
@@ -348,7 +349,7 @@ def test_every_model_learns_with_all_of_its_weights(name, terms, sets, tmp_path)
     assert all(not torch.equal(p, q) for p, q in zip(model.parameters(), before, strict=True))
 
 
-@pytest.mark.parametrize("name", ["resnet", "tkpcn"])
+@pytest.mark.parametrize("name", ["resnet", *seldom("tkpcn")])
 def test_a_training_ends_with_weights_better_than_it_began(name: str, tmp_path: Path) -> None:
     """On a shot that it was not trained on: a network begins with means over 3×3 pixels, and learns of edges."""
     for seed in range(4):
