@@ -229,11 +229,10 @@ def test_two_eyes_do_not_go_into_one_file(tmp_path: Path, capsys: pytest.Capture
     for eye in ("left", "right"):
         save(tmp_path / eye / "shot.0001.exr", view(FRAMES[0]))
     spec = str(tmp_path / "%V" / "shot.####.exr")
-    assert main(["denoise", "--method=classical", spec, "-o", str(tmp_path / "out")]) == 2
+    words = ["denoise", "--method=classical", "-o"]
+    assert main([*words, str(tmp_path / "out"), spec]) == 2
     assert "expected %V or %v in it" in words_in(capsys.readouterr().err)
-    assert (
-        main(["denoise", "--method=classical", str(tmp_path / "none_%V.####.exr"), "-o", str(tmp_path / "out_%V")]) == 1
-    )
+    assert main([*words, str(tmp_path / "out_%V"), str(tmp_path / "none_%V.####.exr")]) == 1
     assert "no view is there" in capsys.readouterr().err
 
 

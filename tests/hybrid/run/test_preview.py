@@ -101,15 +101,8 @@ def test_a_divider_leaves_both_sides_where_they_are():
 def test_the_denoised_side_of_what_blender_has_denoised_is_ours(tmp_path, capsys):
     """Such a file keeps its Noisy Image, which a new look would take for the picture again."""
     source = Path(shutil.copytree(DEFAULTS, tmp_path / "in"))
-    words = [
-        "denoise",
-        "--method=classical",
-        str(source / "noisy.####.exr"),
-        "-o",
-        str(tmp_path / "out"),
-        "--first-pass",
-        "auto",
-    ]
+    words = ["denoise", "--method=classical", str(source / "noisy.####.exr"), "-o", str(tmp_path / "out")]
+    words += ["--first-pass", "auto"]
     assert main([*words, "--preview", str(tmp_path / "a.png")]) == 0, capsys.readouterr().err
     picture = cv2.imread(str(tmp_path / "a.png")).astype(np.float32)
     noisy, denoised = np.split(picture, 2, axis=1)
