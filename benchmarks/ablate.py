@@ -57,7 +57,7 @@ def _first(picture: Any, *_: Any) -> Any:
 # Rules within stages: module, name, and the function or constant in its place.
 RULES: dict[str, tuple[Any, str, Any]] = {
     "agreement": (align, "agreement_weight", _ones),
-    "interpolation": (align, "interpolation_weight", _nothing),
+    "interpolation": (align, "interpolation_weight", lambda warped, *_: np.ones(warped.shape[:2], np.float32)),
     "outlines agree": (align, "combine_confidence", lambda *a, **k: _combine(*a, **{**k, "least": 0.0})),
     "relight": (align, "relight", _nothing),
     "stillness": (stabilize, "measure_stillness", lambda weight, shape: _stillness(None, shape)),
