@@ -1,6 +1,6 @@
 """Make every table, chart and animation of README.md and docs/results.md from one revision.
 
-    python benchmarks/figures.py WORK [--parts ladder filters times pictures] [--scenes FOLDER] [--python FILE]
+    python benchmarks/figures.py WORK [--parts ladder second filters times] [--scenes FOLDER] [--python FILE]
     python benchmarks/figures.py WORK --write
 
 WORK/shots holds the shots of `LADDER`, one folder each; those that are not there are rendered by `ravg simulate`, the
@@ -66,6 +66,13 @@ LADDER: dict[str, tuple[str, ...]] = {
 RENDER = (
     *("--film", "1920x1080", "--size", "192x108", "--frames", "1-7", "--levels", "s008=8,s032=32,s128=128,s512=512"),
     *("--reference", "512", "--reference-frames", "3,4,5"),
+)
+# Scenes of `benchmarks/scenes.py`, of small bright lamps and glass, on which nothing was tuned.
+SECOND = ("neon", "headlamps", "water")
+SECOND_LEVELS = {"s032": 32, "s128": 128}
+RENDER_SECOND = (
+    *("--film", "320x180", "--size", "192x108", "--frames", "4-10", "--levels", "s032=32,s128=128"),
+    *("--reference", "384", "--reference-frames", "6,7,8"),
 )
 SAMPLES = {"s008": 8, "s032": 32, "s128": 128, "s512": 512}
 NAMES = {
@@ -145,22 +152,29 @@ class Record:
 def find_shot(name: str, options: argparse.Namespace) -> Path:
     """The folder of a shot, rendered if it is not there."""
     folder: Path = options.work / "shots" / name
-    if (folder / "reference_b.0005.exr").exists() and any(folder.glob("s*.0007.exr")):
+    if any(folder.glob("reference_b.*.exr")) and any(folder.glob("s*.0007.exr")):
         return folder
     if name in OTHERS:
         _, renderer, *words = OTHERS[name]
         script = str(ROOT / "benchmarks" / "other_renderers.py")
         subprocess.run([sys.executable, script, renderer, str(folder), *words, "--references", "256"], check=True)
     else:
-        scene, *words = LADDER[name]
-        if (own := ROOT / "examples" / "scenes" / scene).exists():
+        scene, *words = LADDER.get(name, (f"{name}.blend", *RENDER_SECOND))
+        words += RENDER if name in LADDER else ()
+        if name in SECOND:
+            script = str(ROOT / "benchmarks" / "scenes.py")
+            subprocess.run(
+                [str(options.python or sys.executable), script, str(options.work / "shots"), name], check=True
+            )
+            scene = str(options.work / "shots" / scene)
+        elif (own := ROOT / "examples" / "scenes" / scene).exists():
             scene = str(own)
         elif scene.endswith(".blend"):
             if options.scenes is None:
                 raise SystemExit(f"figures: expected {folder}, or --scenes with {scene}, got neither")
             scene = str(options.scenes / scene)
         python = [] if options.python is None else ["--python", str(options.python)]
-        command = [sys.executable, "-m", "hybrid.cli", "simulate", scene, "-o", str(folder), *words, *RENDER, *python]
+        command = [sys.executable, "-m", "hybrid.cli", "simulate", scene, "-o", str(folder), *words, *python]
         subprocess.run(command, check=True, cwd=ROOT)
     return folder
 
@@ -180,6 +194,11 @@ def measure_ladder(record: Record, options: argparse.Namespace) -> None:
         for level in SAMPLES:
             judge(record, "ladder", f"{name} {level}", truth, level, NAMES)
         judge(record, "given", name, truth, "s032", RIVALS, first_pass="oidn-best")  # as Blender's button starts
+
+
+def measure_second(record: Record, options: argparse.Namespace) -> None:
+    for name, level in product(SECOND, SECOND_LEVELS):
+        judge(record, "second", f"{name} {level}", ladder.Truth(find_shot(name, options)), level, NAMES)
 
 
 def spread(folder: Path, out: Path, radius: float) -> None:
@@ -312,6 +331,13 @@ def given(results: Results) -> str:
     return _rows(("preset", "mean gain", "worst shot"), rows)
 
 
+def second(results: Results) -> str:
+    """Results: the second ladder."""
+    keys = {f"*{name}*, {n} samples": f"{name} {level}" for name in SECOND for level, n in SECOND_LEVELS.items()}
+    rows = ([shot, *(_pair(results["second"][f"{key} {m}"]) for m in NAMES)] for shot, key in keys.items())
+    return _rows(("shot", *NAMES.values()), rows)
+
+
 def filters(results: Results) -> str:
     """Results: shots whose pixels share noise, and the two renderers' shots where they do not."""
     names = list(dict.fromkeys(key.rpartition(" ")[0] for key in results["filters"]))
@@ -331,7 +357,15 @@ def times(results: Results) -> str:
     return _rows(("method", "CPU time a frame", "peak memory", "of OIDN high", "of OIDN best"), rows)
 
 
-BLOCKS = {"summary": summary, "samples": samples, "shots": shots, "given": given, "filters": filters, "times": times}
+BLOCKS = {
+    "summary": summary,
+    "samples": samples,
+    "shots": shots,
+    "given": given,
+    "second": second,
+    "filters": filters,
+    "times": times,
+}
 
 
 def origin(about: Results) -> str:
@@ -430,7 +464,7 @@ def write(record: Record, options: argparse.Namespace) -> None:
         path.write_text(fill(path.read_text(encoding="utf-8"), results), encoding="utf-8")
 
 
-PARTS = {"ladder": measure_ladder, "filters": measure_filters, "times": measure_times}
+PARTS = {"ladder": measure_ladder, "second": measure_second, "filters": measure_filters, "times": measure_times}
 
 
 def main() -> int:

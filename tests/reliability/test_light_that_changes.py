@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid import denoise_shot, open_shot
+from ravg import denoise_shot, open_shot
 from tests.reliability.test_noise_ladder import psnr
 from tests.scenes import Scene, grained
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid import denoise_shot, open_shot
+from ravg import denoise_shot, open_shot
 from tests.exr_files import write_layers
 
 pytestmark = pytest.mark.reliability

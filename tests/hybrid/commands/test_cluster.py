@@ -218,9 +218,8 @@ def test_the_preview_of_several_pictures_is_that_of_the_first(cluster, tmp_path)
     assert (tmp_path / "x.png").is_file()
 
 
-def test_no_scheduler_is_one_line(shot, tmp_path, capsys, monkeypatch):
+def test_no_scheduler_is_one_line(shot, tmp_path, capsys):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("hybrid.commands.cluster.PATIENCE", 0.5)
     words = ["denoise", "--method=classical", str(shot), "-o", str(tmp_path / "out"), "--scheduler", NOBODY]
     assert main(words) == 1
     assert capsys.readouterr().err.splitlines()[-1].startswith(f"error: no Dask scheduler answers at {NOBODY}")
