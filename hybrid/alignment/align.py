@@ -398,7 +398,9 @@ def _warp_first_pass(
         raise ValueError(f"frame {window.centre.number} has no first pass, expected one like its neighbours")
     warped = np.empty((len(first_pass), *middle[rows].shape), np.float32)
     weights: list[Array | None] = [None] * len(first_pass)
-    noise = measure_noise(window.centre.radiance[rows], middle[rows]) if weigh else None
+    noise = None
+    if weigh:
+        noise = measure_noise(window.centre.radiance[rows], middle[rows], window.lit.as_rendered.exposure)
     for index, (picture, link) in enumerate(zip(first_pass, window.links, strict=True)):
         flow = window.light_flow(index, rows)
         if link is None or flow is None or picture is None:

@@ -388,7 +388,7 @@ def test_neighbours_count_by_their_samples(tmp_path):
     scene = replace(CALM, height=180, width=240, noise=0.001)
     shot = open_shot(scene.write(tmp_path / "a", edit=grain), frames="1007-1011")
     stream = FrameStream(shot, Rules(), PerFrame(lambda frame: frame.color))
-    # The square of 1 / 64, which is known to a fifth of it or so; a frame of fewer samples counts its neighbours in full.
+    # The square of 1 / 64, which is known to a fifth or so. A frame of fewer samples counts its neighbours in full.
     few = 1 / 64**2
     assert stream.window(1009).own_samples == pytest.approx([few, few, 1, few, few], rel=0.8)
     assert stream.window(1010).own_samples == (1, 1, 1, 1, 1)
