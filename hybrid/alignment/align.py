@@ -11,7 +11,7 @@ from flow.warp import warp
 from hybrid.alignment.guides import average_guides
 from hybrid.alignment.neighbour import combine_confidence, confidence_by_geometry, novelty_of
 from hybrid.alignment.prepare import ALPHA, PreparedFrame
-from hybrid.alignment.transfer import demodulate, remodulate
+from hybrid.alignment.transfer import demodulate, measure_exposure, remodulate
 from hybrid.alignment.window import (
     AlignedWindow,
     Centre,
@@ -400,7 +400,7 @@ def _warp_first_pass(
     weights: list[Array | None] = [None] * len(first_pass)
     noise = None
     if weigh:
-        noise = measure_noise(window.centre.radiance[rows], middle[rows], window.lit.as_rendered.exposure)
+        noise = measure_noise(window.centre.radiance[rows], middle[rows], measure_exposure(middle))
     for index, (picture, link) in enumerate(zip(first_pass, window.links, strict=True)):
         flow = window.light_flow(index, rows)
         if link is None or flow is None or picture is None:

@@ -727,8 +727,9 @@ def _samples_ratio(earlier: PreparedFrame, later: PreparedFrame) -> float:
     grainy = np.minimum(noises[0], noises[1]) > GRAIN
     if np.count_nonzero(grainy) < FEW:
         return 1.0
-    ratio = float(np.median(noises[0][grainy] / noises[1][grainy])) ** 2
-    return ratio if max(ratio, 1 / ratio) >= UNEQUAL else 1.0
+    # Detail that changes has no one ratio: three quarters of the places must show it.
+    least, ratio, most = np.quantile(noises[0][grainy] / noises[1][grainy], (0.25, 0.5, 0.75)) ** 2
+    return float(ratio) if least >= UNEQUAL or most <= 1 / UNEQUAL else 1.0
 
 
 def _second_differences(layer: Array) -> tuple[Array, Array]:

@@ -161,8 +161,7 @@ KNOWN = {
     ("emitters of black albedo", "draft"): 16,
     ("a screen in a fade", "draft"): 9,
     ("a screen in a fade", "fast"): 3,
-    ("a fade through black", "fast"): 2.5,
-    ("lamps of black albedo", "fast"): 3.5,
+    ("a fade through black", "fast"): 1.5,
     ("a beam of a pixel", "fast"): 2,
     ("rain", "fast"): 2,
 }
