@@ -128,9 +128,11 @@ class ViewPlayer extends Player {
     this.canvas.dataset.frame = number ?? "";
     this.canvas.dataset.exact = [left, right].every((side) => source.isExact(side, state));
     if (!state.playing) showFacts();
+    if (pointer) readOut(pointer);
   }
 }
 
+let pointer = null; // the latest event of the pointer over the picture
 const source = new Frames();
 const side = { sequence: 0, layer: "", ev: 0, view: "srgb" };
 const player = new ViewPlayer(source, { flipMs: 0, state: { left: side, right: side } });
@@ -246,6 +248,7 @@ function mebibytes(bytes) {
 let pointed = 0;
 
 async function readOut(event) {
+  pointer = event;
   const { x, y } = player.under(event), { width, height } = source.size(), mine = ++pointed;
   const at = [Math.floor(x * width), Math.floor(y * height)], number = source.frames[player.state.frame];
   if (x < 0 || y < 0 || x >= 1 || y >= 1 || number === undefined || player.state.playing) return;

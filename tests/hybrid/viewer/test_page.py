@@ -136,6 +136,9 @@ def test_the_values_under_the_pointer_are_shown(page):
     assert len(said) == 3
     values = {line.split(":")[0]: float(line.split("R ")[1].split()[0]) for line in said[1:]}
     assert values == {"noisy": pytest.approx(GRAY, rel=1e-3), "out": pytest.approx(GRAY / 2, rel=1e-3)}
+    page.keyboard.press("x")  # the values are those of what is shown now
+    swapped = "() => document.querySelector('#readout').innerText.split('\\n')[1].startsWith('out')"
+    page.wait_for_function(swapped)
 
 
 def test_exposure_is_in_stops(page, served):
