@@ -67,7 +67,7 @@ RENDER = (
     *("--film", "1920x1080", "--size", "192x108", "--frames", "1-7", "--levels", "s008=8,s032=32,s128=128,s512=512"),
     *("--reference", "512", "--reference-frames", "3,4,5"),
 )
-# Scenes of `benchmarks/scenes.py`, of small bright lamps and glass, on which nothing was tuned.
+# Scenes of `benchmarks/scenes.py`, of small bright lamps and glass; one rule was chosen with them in view.
 SECOND = ("neon", "headlamps", "water")
 SECOND_LEVELS = {"s032": 32, "s128": 128}
 RENDER_SECOND = (

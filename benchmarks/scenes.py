@@ -1,4 +1,4 @@
-"""Write scenes of small bright lamps, glass and metal: shots to judge the denoiser by, on which nothing was tuned.
+"""Write scenes of small bright lamps, glass and metal: shots to judge the denoiser by.
 
     python benchmarks/scenes.py FOLDER [NAME ...]
 

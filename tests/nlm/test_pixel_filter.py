@@ -80,6 +80,21 @@ def test_a_filter_undone_leaves_white_noise_and_applied_again_the_image(r):
     np.testing.assert_allclose(found.apply(undone), image, atol=2e-3 * image.std())
 
 
+def test_a_small_picture_gets_no_halos():
+    """Correlations of 80×48 pixels, which err by 0.05: the edge of a lamp was spread by a twentieth of it."""
+    lamp = np.full((40, 60), 0.05, np.float32)
+    lamp[10:30, 20:40] = 5
+    seen = spread(lamp, 0.2)[..., None]
+    for along_x, along_y in (
+        ((0.423, 0.083, 0.066, 0.021), (0.394, 0.089, 0.028, -0.02)),
+        ((0.417, 0.067, 0.107, 0.062), (0.345, 0.086, 0.067, 0.051)),
+        ((0.389, -0.006, -0.058, -0.029), (0.446, 0.141, 0.003, -0.019)),
+    ):
+        found = find_filter(np.array([along_x, along_y]))
+        shown = found.apply(np.maximum(found.undo(seen), 0))  # denoisers count negative light as 0
+        np.testing.assert_allclose(shown, seen, atol=0.12)
+
+
 def test_a_constant_stays():
     found = find_filter(np.array([[0.4, 0.05, 0, 0], [0.3, 0.02, 0, 0]]))
     flat = np.full((20, 30, 3), 5, np.float32)

@@ -97,6 +97,19 @@ def test_samples_of_two_frames_are_as_stated_or_as_their_noise_has_them(samples,
     assert found == 1 if max(expected, 1 / expected) < UNEQUAL else found == pytest.approx(expected, rel=0.3)
 
 
+def test_detail_that_comes_is_no_noise_of_fewer_samples() -> None:
+    """The noise of more than half of the places seems greater, and that of the others is the same."""
+    rng = np.random.default_rng(5)
+
+    def frame(number: int, detail: float):
+        color = rng.normal(1, 0.01, (160, 256, 3))
+        color[:, :160] *= rng.normal(1, detail, (160, 160, 1))
+        return prepare(Frame(number, color.astype(np.float32)))
+
+    pair = frame(1, 0.0), frame(2, 0.1)
+    assert measure_pair(*pair, (shrink(pair[0]), shrink(pair[1]))).samples == 1
+
+
 @pytest.mark.parametrize("noise", [0, 0.05])
 def test_alpha_has_noise_where_it_is_soft_and_none_at_outlines(noise) -> None:
     y, x = np.mgrid[:96, :128].astype(np.float32)
