@@ -1,11 +1,11 @@
 """CPU seconds and peak memory of whole processes at film size, beside OIDN's in the same run, as JSON.
 
-    python benchmarks/bench_shot.py [--shots pan busy] [--frames 10] [--scale 6] [--commands "denoise --preset fast"]
+    python benchmarks/bench_shot.py [--shots pan busy] [--frames 10] [--scale 4] [--commands "denoise --preset fast"]
     python benchmarks/bench_shot.py --write FOLDER    # the shots alone
 
 Shots are made of the bundled one, which runs to and fro:
 
-- *pan*: the clean frames enlarged, 1920×1080 at scale 6, with the noise of the noisy frames laid on anew in each, pixel
+- *pan*: the clean frames enlarged, 1920×1080 at scale 4, with the noise of the noisy frames laid on anew in each, pixel
   by pixel. Vectors are enlarged and hold.
 - *busy*: the same with a textured disc that flies through with the vectors of what is behind it, a shadow with a soft
   edge that moves, and noise in a part of the guides: refinement, gate and prefilter are called for.
@@ -37,7 +37,7 @@ from hybrid.run.records import read_records
 from tests.exr_files import write_layers
 
 SHOT = Path(__file__).parent.parent / "examples" / "shot"
-REPEAT = 6
+REPEAT = 4
 VIEW = "ViewLayer"
 SHOTS = ("pan", "busy", "tiled")
 PREFILTERS = {"high": None, "best": "high"}
@@ -55,7 +55,8 @@ def tile_shot(folder: Path, frames: int, scale: int = REPEAT) -> None:
 
 def enlarge_shot(folder: Path, frames: int, scale: int = REPEAT, *, busy: bool = False) -> None:
     """Write the bundled shot enlarged, with noise of the size of a pixel; `busy`: with what vectors do not explain."""
-    noisy, clean = (sorted(SHOT.glob(f"{name}.*.exr")) for name in ("noisy", "reference"))
+    clean = sorted(SHOT.glob("reference_a.*.exr"))
+    noisy = [SHOT / path.name.replace("reference_a", "noisy") for path in clean]
     for number, (index, *around) in enumerate(_to_and_fro(len(noisy), frames), start=1):
         random = np.random.default_rng(number)
         small = _read(noisy[index])
@@ -95,11 +96,11 @@ def _disturb(
     albedo, normal = layers[f"{VIEW}.Denoising Albedo"], layers[f"{VIEW}.Denoising Normal"]
     height, width = light.shape[:2]
     y, x = np.mgrid[:height, :width].astype(np.float32) / np.float32(scale)
-    shadow = np.hypot(x - (60 + 4 * number), y - 110)
-    light *= (1 - 0.6 / (1 + np.exp((shadow - 40) / 4)))[..., None].astype(np.float32)
-    left, top = x - (90 + 3 * number), y - (60 + number)
-    inside = np.hypot(left, top) < 28
-    checks = np.where((left // 7 + top // 7) % 2 > 0, np.float32(0.7), np.float32(0.2))
+    shadow = np.hypot(x - (90 + 6 * number), y - 165)
+    light *= (1 - 0.6 / (1 + np.exp((shadow - 60) / 6)))[..., None].astype(np.float32)
+    left, top = x - (135 + 4 * number), y - (90 + number)
+    inside = np.hypot(left, top) < 42
+    checks = np.where((left // 10 + top // 10) % 2 > 0, np.float32(0.7), np.float32(0.2))
     stripes = 0.5 + 0.5 * np.sin(2 * left + top)
     light[inside] = np.float32(light.mean()) * (checks * (0.5 + stripes))[inside, None]
     albedo[inside], normal[inside] = checks[inside, None], (0, 0, 1)
@@ -107,6 +108,7 @@ def _disturb(
         part = guide[:, : 2 * width // 5]
         part += random.normal(0, deviation, part.shape).astype(np.float32)
     np.maximum(albedo, 0, out=albedo)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1)  # a mean of unit vectors is no longer
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
@@ -159,7 +161,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--shots", nargs="+", choices=SHOTS, default=["pan", "busy"])
     parser.add_argument("--frames", type=int, default=10)
-    parser.add_argument("--scale", type=int, default=REPEAT, help="6 for 1920×1080")
+    parser.add_argument("--scale", type=int, default=REPEAT, help="4 for 1920×1080")
     presets = [f"denoise --preset {preset}" for preset in ("fast", "balanced", "quality")]
     parser.add_argument("--commands", nargs="*", default=presets)
     parser.add_argument("--oidn", nargs="*", choices=sorted(PREFILTERS), default=["high", "best"])
@@ -176,7 +178,7 @@ def main(argv: list[str] | None = None) -> int:
             pattern = write_shot(shot, folder, options.frames, options.scale)
             if options.write:
                 continue
-            facts = {"shot": shot, "frames": options.frames, "size": f"{320 * options.scale}x{180 * options.scale}"}
+            facts = {"shot": shot, "frames": options.frames, "size": f"{480 * options.scale}x{270 * options.scale}"}
             for mode in options.oidn:
                 words = [sys.executable, __file__, "--run-oidn", pattern, str(folder / "oidn"), mode]
                 print(json.dumps({**facts, "command": f"OIDN {mode}", **_per_frame(measure(words), options.frames)}))

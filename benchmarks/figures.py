@@ -34,12 +34,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import ladder
-from bench_shot import measure, write_shot
+from bench_shot import REPEAT, measure, write_shot
 
 from hybrid.files.exr import read_exr
 from hybrid.files.frame import Array
 from hybrid.files.movies import write_movie
-from hybrid.files.png import encode_bytes, write_png
+from hybrid.files.png import encode_bytes, measure_middle_gray, write_label, write_png
+from hybrid.files.shots import Shot
 from ravg import open_shot
 from tests.exr_files import write_layers
 
@@ -74,6 +75,20 @@ RENDER_SECOND = (
     *("--film", "320x180", "--size", "192x108", "--frames", "4-10", "--levels", "s032=32,s128=128"),
     *("--reference", "384", "--reference-frames", "6,7,8"),
 )
+# Shots with the defaults of Blender 5.0, whose files hold its denoised frames too: scene and options of each.
+BLENDER: dict[str, tuple[str, ...]] = {
+    "blender-staircase": ("wooden_staircase.blend", "--moving-objects", "2"),
+    "blender-classroom": ("classroom.blend", "--moving-objects", "2"),
+    "blender-kitchen": ("country_kitchen.blend", "--moving-objects", "2"),
+    "blender-chalice": ("chalice.blend", "--moving-objects", "1"),
+    "blender-neon": ("neon.blend",),
+    "blender-headlamps": ("headlamps.blend",),
+}
+BLENDER_LEVELS = {"s008": 8, "s064": 64}
+RENDER_BLENDER = (
+    *("--defaults", "--film", "480x270", "--size", "192x108", "--frames", "4-10", "--levels", "s008=8,s064=64"),
+    *("--reference", "160", "--reference-frames", "6-8", "--second-reference"),
+)
 SAMPLES = {"s008": 8, "s032": 32, "s128": 128, "s512": 512}
 NAMES = {
     "noisy": "noisy",
@@ -95,7 +110,7 @@ OTHERS: dict[str, tuple[str, ...]] = {
     "luxcore-path": ("s016", "luxcore-path", "--samples", "16"),
 }
 LIGHT = ("Combined", "Denoising Albedo", "Denoising Normal")
-TIMED_FRAMES = 4
+TIMED_FRAMES = 8
 Results = dict[str, Any]
 
 
@@ -149,6 +164,19 @@ class Record:
             print(part, key, *self.values[part][key], flush=True)
 
 
+def find_scene(scene: str, options: argparse.Namespace) -> str:
+    """Path of a .blend file, written if it is one of `SECOND`; any other scene as it is."""
+    if scene.removesuffix(".blend") in SECOND:
+        script, out = ROOT / "benchmarks" / "scenes.py", options.work / "shots"
+        subprocess.run([str(options.python or sys.executable), str(script), str(out), scene[:-6]], check=True)
+        return str(out / scene)
+    if (own := ROOT / "examples" / "scenes" / scene).exists() or not scene.endswith(".blend"):
+        return str(own) if own.exists() else scene
+    if options.scenes is None:
+        raise SystemExit(f"figures: expected --scenes with {scene}, got none")
+    return str(options.scenes / scene)
+
+
 def find_shot(name: str, options: argparse.Namespace) -> Path:
     """The folder of a shot, rendered if it is not there."""
     folder: Path = options.work / "shots" / name
@@ -158,34 +186,25 @@ def find_shot(name: str, options: argparse.Namespace) -> Path:
         _, renderer, *words = OTHERS[name]
         script = str(ROOT / "benchmarks" / "other_renderers.py")
         subprocess.run([sys.executable, script, renderer, str(folder), *words, "--references", "256"], check=True)
+    elif name in BLENDER:
+        scene, *words = BLENDER[name]
+        script = str(ROOT / "examples" / "render_shot.py")
+        python = str(options.python or sys.executable)
+        subprocess.run([python, script, find_scene(scene, options), str(folder), *words, *RENDER_BLENDER], check=True)
     else:
         scene, *words = LADDER.get(name, (f"{name}.blend", *RENDER_SECOND))
         words += RENDER if name in LADDER else ()
-        if name in SECOND:
-            script = str(ROOT / "benchmarks" / "scenes.py")
-            subprocess.run(
-                [str(options.python or sys.executable), script, str(options.work / "shots"), name], check=True
-            )
-            scene = str(options.work / "shots" / scene)
-        elif (own := ROOT / "examples" / "scenes" / scene).exists():
-            scene = str(own)
-        elif scene.endswith(".blend"):
-            if options.scenes is None:
-                raise SystemExit(f"figures: expected {folder}, or --scenes with {scene}, got neither")
-            scene = str(options.scenes / scene)
         python = [] if options.python is None else ["--python", str(options.python)]
-        command = [sys.executable, "-m", "hybrid.cli", "simulate", scene, "-o", str(folder), *words, *python]
-        subprocess.run(command, check=True, cwd=ROOT)
+        command = ["-m", "hybrid.cli", "simulate", find_scene(scene, options), "-o", str(folder), *words, *python]
+        subprocess.run([sys.executable, *command], check=True, cwd=ROOT)
     return folder
 
 
-def judge(
-    record: Record, part: str, key: str, truth: ladder.Truth, level: str, methods: Iterable[str], **options: Any
-) -> None:
+def judge(record: Record, part: str, key: str, truth: ladder.Truth, level: str, methods: Iterable[str]) -> None:
     """Add PSNR and temporal PSNR of methods on a level of a shot."""
     shot = truth.shot(level)
     for method in methods:
-        record.add(part, f"{key} {method}", lambda m=method: truth.judge(shot, ladder.denoise(shot, m, **options)))
+        record.add(part, f"{key} {method}", lambda m=method: truth.judge(shot, ladder.denoise(shot, m)))
 
 
 def measure_ladder(record: Record, options: argparse.Namespace) -> None:
@@ -193,12 +212,25 @@ def measure_ladder(record: Record, options: argparse.Namespace) -> None:
         truth = ladder.Truth(find_shot(name, options))
         for level in SAMPLES:
             judge(record, "ladder", f"{name} {level}", truth, level, NAMES)
-        judge(record, "given", name, truth, "s032", RIVALS, first_pass="oidn-best")  # as Blender's button starts
 
 
 def measure_second(record: Record, options: argparse.Namespace) -> None:
     for name, level in product(SECOND, SECOND_LEVELS):
         judge(record, "second", f"{name} {level}", ladder.Truth(find_shot(name, options)), level, NAMES)
+
+
+def measure_blender(record: Record, options: argparse.Namespace) -> None:
+    """Blender's own denoised frames, and presets that start from them; PSNR of each frame follows the means."""
+    for name, level in product(BLENDER, BLENDER_LEVELS):
+        truth = ladder.Truth(find_shot(name, options))
+        shot = truth.shot(level)
+
+        def figures(method: str, truth: ladder.Truth = truth, shot: Shot = shot) -> list[float]:
+            images = ladder.denoise(shot, method)
+            return [*truth.judge(shot, images), *truth.frames(images)]
+
+        for method in ("noisy", "given", *RIVALS):
+            record.add("blender", f"{name} {level} {method}", partial(figures, method))
 
 
 def spread(folder: Path, out: Path, radius: float) -> None:
@@ -229,7 +261,7 @@ def measure_times(record: Record, options: argparse.Namespace) -> None:
     folder = options.work / "busy"
     pattern = str(folder / "busy.####.exr")
     if len(list(folder.glob("busy.*.exr"))) < TIMED_FRAMES:
-        write_shot("busy", folder, TIMED_FRAMES, 6)
+        write_shot("busy", folder, TIMED_FRAMES, REPEAT)
     bench = str(ROOT / "benchmarks" / "bench_shot.py")
 
     def cost(method: str) -> list[float]:
@@ -292,10 +324,11 @@ def summary(results: Results) -> str:
     worst, _ = _worst(_gains(results, "s032", "quality"))
     names = NAMES | {"balanced": "`balanced` (default)", "oidn-best": "OIDN best, as in Blender"}
     shown = {names[method]: (_of(results, "s032", method), _cost(results, method)) for method in NAMES}
-    on_best = {name: results["given"][f"{name} balanced"] for name in LADDER}
-    shown["`balanced` on frames of OIDN best"] = on_best, ("–", "–")
     rows = ([name, _pair(_mean(figures)), _pair(figures[worst]), *cost] for name, (figures, cost) in shown.items())
-    return _rows(("method", "mean", f"worst shot (*{worst}*)", "CPU time", "memory"), rows)
+    gain = _pair(_mean(_gains(results, "s032", "balanced")), signed=True)
+    share = results["times"]["balanced"][0] / results["times"]["oidn-best"][0]
+    claim = f"ravg's default preset gains {gain} dB over OIDN best, in {share:.2f} of its CPU time.\n\n"
+    return claim + _rows(("method", "mean", f"worst shot (*{worst}*)", "CPU time", "memory"), rows)
 
 
 def samples(results: Results) -> str:
@@ -320,22 +353,43 @@ def shots(results: Results) -> str:
     )
 
 
-def given(results: Results) -> str:
-    """Results: presets on OIDN best's own frames, over these frames."""
-    rows = []
-    for method in RIVALS:
-        best = _of(results, "s032", "oidn-best")
-        gains = {n: [a - b for a, b in zip(results["given"][f"{n} {method}"], best[n], strict=True)] for n in best}
-        name, worst = _worst(gains)
-        rows.append([NAMES[method], _pair(_mean(gains), signed=True), f"{_pair(worst, signed=True)} *{name}*"])
-    return _rows(("preset", "mean gain", "worst shot"), rows)
-
-
 def second(results: Results) -> str:
     """Results: the second ladder."""
     keys = {f"*{name}*, {n} samples": f"{name} {level}" for name in SECOND for level, n in SECOND_LEVELS.items()}
     rows = ([shot, *(_pair(results["second"][f"{key} {m}"]) for m in NAMES)] for shot, key in keys.items())
     return _rows(("shot", *NAMES.values()), rows)
+
+
+def _blender_gains(results: Results, level: str, method: str) -> dict[str, list[float]]:
+    """Gains of a preset over Blender's own frames on each shot, the means first and then each frame's."""
+    found = {name: [results["blender"][f"{name} {level} {m}"] for m in (method, "given")] for name in BLENDER}
+    return {name: [a - b for a, b in zip(*pair, strict=True)] for name, pair in found.items()}
+
+
+def blender(results: Results) -> str:
+    """Results: presets that start from Blender's own frames."""
+    names = NAMES | {"given": "Blender's"}
+    shown = ("noisy", "given", *RIVALS)
+    rows = [
+        [
+            f"*{name.removeprefix('blender-')}*, {BLENDER_LEVELS[level]} samples",
+            *(_pair(results["blender"][f"{name} {level} {method}"][:2]) for method in shown),
+        ]
+        for name, level in product(BLENDER, BLENDER_LEVELS)
+    ]
+    return _rows(("shot", *(names[method] for method in shown)), rows)
+
+
+def default_settings(results: Results) -> str:
+    """README: gains over Blender's own frames."""
+    rows = []
+    for method in RIVALS:
+        gains = [_blender_gains(results, level, method) for level in BLENDER_LEVELS]
+        least = min(value for each in gains for shot in each.values() for value in shot[2:])
+        means = (_pair(_mean(each)[:2], signed=True) for each in gains)
+        rows.append([NAMES[method], *means, _pair([least], signed=True)])
+    head = (f"{number} samples" for number in BLENDER_LEVELS.values())
+    return _rows(("preset", *head, "worst frame"), rows)
 
 
 def filters(results: Results) -> str:
@@ -361,8 +415,9 @@ BLOCKS = {
     "summary": summary,
     "samples": samples,
     "shots": shots,
-    "given": given,
     "second": second,
+    "blender": blender,
+    "default_settings": default_settings,
     "filters": filters,
     "times": times,
 }
@@ -389,28 +444,22 @@ def fill(text: str, results: Results) -> str:
 # Pictures.
 
 
-def _label(image: Array, text: str) -> Array:
-    for thickness, gray in ((3, 0), (1, 255)):  # white on black is readable on any picture
-        cv2.putText(image, text, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (gray,) * 3, thickness, cv2.LINE_AA)
-    return image
-
-
 def _beside(images: dict[str, Array], scale: int, middle: float) -> Array:
     """Labelled images side by side, enlarged by whole pixels; `middle` is shown at 0.18 in linear light."""
     shown = {
         name: encode_bytes(np.repeat(np.repeat(image, scale, 0), scale, 1) * np.float32(0.18 / middle))
         for name, image in images.items()
     }
-    return np.concatenate(
-        [_label(np.ascontiguousarray(image), NAMES.get(n, n).strip("`")) for n, image in shown.items()], 1
-    )
+    for name, image in shown.items():
+        write_label(image, NAMES.get(name, name).strip("`"))
+    return np.concatenate(list(shown.values()), 1)
 
 
 def draw_motion(options: argparse.Namespace) -> None:
     """README: seven frames of *kitchen* at 8 samples as they play."""
     shot = open_shot(f"{find_shot('kitchen', options)}/s008.####.exr")
     images = {method: ladder.denoise(shot, method) for method in ("noisy", "oidn-best", "balanced")}
-    middle = float(np.mean(images["oidn-best"][0]))
+    middle = measure_middle_gray(images["oidn-best"][0])
     frames = [_beside({m: row[i] for m, row in images.items()}, 2, middle) for i in range(len(shot.numbers))]
     write_movie(IMAGES / "motion.webp", iter([*frames, *frames[-2:0:-1]]), 8.0)
 
@@ -443,7 +492,7 @@ def draw_filter(options: argparse.Namespace) -> None:
         shot = truth.shot("s032")
         images = {method: ladder.denoise(shot, method)[1] for method in ("noisy", "oidn-best", "balanced")}
         images["1024 samples"] = sum(truth.references[1]) / np.float32(2)
-        write_png(IMAGES / "filter.png", _beside(images, 2, float(np.mean(images["1024 samples"]))) / 255)
+        write_png(IMAGES / "filter.png", _beside(images, 2, measure_middle_gray(images["1024 samples"])) / 255)
 
 
 PICTURES = {"motion.webp": draw_motion, "flicker.png": draw_flicker, "filter.png": draw_filter}
@@ -464,7 +513,13 @@ def write(record: Record, options: argparse.Namespace) -> None:
         path.write_text(fill(path.read_text(encoding="utf-8"), results), encoding="utf-8")
 
 
-PARTS = {"ladder": measure_ladder, "second": measure_second, "filters": measure_filters, "times": measure_times}
+PARTS = {
+    "ladder": measure_ladder,
+    "second": measure_second,
+    "blender": measure_blender,
+    "filters": measure_filters,
+    "times": measure_times,
+}
 
 
 def main() -> int:

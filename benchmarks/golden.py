@@ -20,11 +20,12 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import OpenEXR
 
 HERE = Path(__file__).resolve().parent.parent
-SHOT = HERE / "examples" / "shot"
+SHOT = HERE / "tests" / "data" / "bathroom"
 BF16, F32 = ["--precision", "bfloat16"], ["--precision", "float32"]
 #: Name → shot and arguments.
 CONFIGURATIONS: dict[str, tuple[str, list[str]]] = {
@@ -40,11 +41,11 @@ CONFIGURATIONS: dict[str, tuple[str, list[str]]] = {
     "final": ("plain", ["denoise", "--method", "classical", "--preset", "final"]),
     "classical-sequence": (
         "plain",
-        ["denoise", "--method", "classical", "--first-pass", "sequence/reference.####.exr"],
+        ["denoise", "--method", "classical", "--first-pass", "sequence/smooth.####.exr"],
     ),
     "nlm": ("plain", ["denoise", "--first-pass", "nlm", *F32]),
     "bundled": ("plain", ["denoise", "--first-pass", "bundled", *F32]),
-    "sequence": ("plain", ["denoise", "--first-pass", "sequence/reference.####.exr", *F32]),
+    "sequence": ("plain", ["denoise", "--first-pass", "sequence/smooth.####.exr", *F32]),
     "oidn-best": ("plain", ["denoise", "--first-pass", "oidn-best", *F32]),
     "first-pass-none": ("plain", ["denoise", "--first-pass", "none", *F32]),
     "bands": ("tall", ["denoise", "--first-pass", "nlm", "--max-memory", "690M", *F32]),
@@ -65,8 +66,8 @@ UNCOMPARED = ("ravg/versions", "ravg/settings", "ravg/command", "ravg/made-from"
 
 
 def write_shots(folder: Path) -> None:
-    frames = [_cropped(8 + index, slice(60, 124), slice(100, 196)) for index in range(5)]
-    tall = [_cropped(8 + index, slice(0, 180), slice(60, 260)) for index in range(2)]
+    frames = [_cropped(9 + index, slice(60, 124), slice(100, 196)) for index in range(5)]
+    tall = [_cropped(9 + index, slice(0, 180), slice(60, 260)) for index in range(2)]
     tall = [{name: np.concatenate([layer] * 8) for name, layer in frame.items()} for frame in tall]
     _write(folder / "plain", frames)
     _write(folder / "tall", tall)
@@ -80,15 +81,14 @@ def write_shots(folder: Path) -> None:
     two = [{**f, **{n.replace("ViewLayer", "Second"): layer[::-1] for n, layer in f.items()}} for f in frames[:3]]
     _write(folder / "views", two)
     (folder / "sequence").mkdir()
-    for index in range(5):
-        reference = _cropped(8 + index, slice(60, 124), slice(100, 196), "reference")
-        name, layer = next(iter(reference.items()))
-        _write_exr(folder / "sequence" / f"reference.{index + 1:04d}.exr", {name: layer})
+    for index, frame in enumerate(frames):
+        smooth = cv2.GaussianBlur(frame[color].astype(np.float32), (0, 0), 2)  # as a denoiser of no detail
+        _write_exr(folder / "sequence" / f"smooth.{index + 1:04d}.exr", {color: smooth})
 
 
-def _cropped(number: int, rows: slice, columns: slice, level: str = "noisy") -> dict[str, np.ndarray]:
-    """Layers of a frame of the bundled shot, cropped."""
-    with OpenEXR.File(str(SHOT / f"{level}.{number:04d}.exr")) as file:
+def _cropped(number: int, rows: slice, columns: slice) -> dict[str, np.ndarray]:
+    """Layers of a frame of *bathroom*, cropped."""
+    with OpenEXR.File(str(SHOT / f"noisy.{number:04d}.exr")) as file:
         return {name: channel.pixels[rows, columns].copy() for name, channel in file.channels().items()}
 
 

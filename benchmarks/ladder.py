@@ -47,13 +47,17 @@ def denoise(shot: Shot, method: str, **options: object) -> list[Array]:
     frames = [shot.read(number) for number in shot.numbers]
     if method == "noisy":
         return [frame.color for frame in frames]
+    if method == "given":
+        return [frame.estimate for frame in frames]  # type: ignore
     if method in OIDN:
         return [denoise_oidn(f.color, f.albedo, f.normal, prefilter=OIDN[method]) for f in frames]  # type: ignore
     with tempfile.TemporaryDirectory() as folder:
         pattern = f"{folder}/frame.####.exr"
         list(denoise_shot(shot, pattern, **NOISY_ALONE.get(method, {"preset": method}), **options))  # type: ignore
         made = open_shot(pattern)
-        return [made.read(number).color for number in shot.numbers]
+        frames = [made.read(number) for number in shot.numbers]
+    # Files that keep the noisy image beside the denoised one are read as it.
+    return [frame.color if frame.estimate is None else frame.estimate for frame in frames]
 
 
 def levels(folder: Path) -> Iterator[str]:
@@ -75,9 +79,13 @@ class Truth:
         """The frames of a level that have references."""
         return open_shot(f"{self.folder}/{level}.####.exr", frames=f"{self.numbers[0]}-{self.numbers[-1]}")
 
+    def frames(self, images: list[Array]) -> list[float]:
+        """PSNR of each image, dB."""
+        return [round(float(min(psnr(*pair), MOST)), 3) for pair in zip(images, self.references, strict=True)]
+
     def judge(self, shot: Shot, images: list[Array]) -> list[float]:
         """PSNR of the images of a shot, and temporal PSNR where there are vectors: means over the frames, dB."""
-        figures = [np.mean([min(psnr(*pair), MOST) for pair in zip(images, self.references, strict=True)])]
+        figures = [np.mean(self.frames(images))]
         frames = [shot.read(number) for number in shot.numbers]
         motion = [motion_between(*pair) for pair in pairwise(frames)]
         if motion and None not in motion:

@@ -73,7 +73,7 @@ def _of_passes(scene: bpy.types.Scene) -> Iterator[Problem]:
         yield Problem("Engine is not Cycles: its noise is not of the kind that ravg removes, choose Cycles", False)
         return
     if scene.frame_step > 1:
-        text = "Frame Step is not 1: the Vector pass leads to frames that are missing, Blender's own frames are better"
+        text = "Frame Step is not 1: the Vector pass leads to frames that are missing, ravg gains less"
         yield Problem(f"{text}: set it to 1, or do not denoise them", False)
     layers = _layers(scene)
     if any(not layer.cycles.denoising_store_passes for layer in layers):

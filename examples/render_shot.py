@@ -3,7 +3,8 @@
     python examples/render_shot.py scene.blend out/shot --spp 32 --reference 512
 
 Writes one multi-layer EXR per frame and noise level, in the layout that Blender's own
-"OpenEXR MultiLayer" output has: ``out/shot/noisy.0008.exr``, ``out/shot/reference.0008.exr``.
+"OpenEXR MultiLayer" output has: ``out/shot/noisy.0008.exr``, ``out/shot/reference.0008.exr``; two references are
+``reference_a`` and ``reference_b``.
 The image is a crop (render border) of a film-size camera, so that motion and texture have the
 statistics of a real shot and not those of a thumbnail. Existing frames are skipped, so an interrupted
 run can be resumed.
@@ -36,11 +37,13 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--levels", default="noisy=32", help="NAME=SPP[,NAME=SPP…]; independent seeds")
     parser.add_argument("--reference", type=int, default=0, help="samples per pixel of a reference; 0: none")
     parser.add_argument("--reference-frames", metavar="FIRST-LAST", help="frames with a reference; default: all")
-    parser.add_argument("--second-reference", action="store_true", help="add reference_b, of other seeds")
+    parser.add_argument(
+        "--second-reference", action="store_true", help="write reference_a and reference_b, of other seeds"
+    )
     parser.add_argument("--moving-objects", type=int, default=0, help="add objects that cross the crop")
     defaults = "Blender's defaults: OIDN with its passes stored, adaptive sampling, clamped indirect light, one seed"
     parser.add_argument("--defaults", action="store_true", help=defaults)
-    parser.add_argument("--compact", action="store_true", help="write all channels as half, without denoising depth")
+    parser.add_argument("--compact", action="store_true", help="write rounded halves, without denoising depth")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--threads", type=int, default=2)
     return parser.parse_args(argv)
@@ -161,11 +164,23 @@ def render_level(scene: bpy.types.Scene, folder: Path, name: str, spp: int, fram
         partial.rename(path)
 
 
+STEPS = {"Denoising Albedo": 1 / 64, "Denoising Normal": 1 / 128, "Vector": 1 / 32}
+
+
+def rounded(name: str, pixels: np.ndarray) -> np.ndarray:
+    """A channel as half, rounded far below the noise of a few samples: to `STEPS`, others to six bits."""
+    step = next((step for layer, step in STEPS.items() if layer in name), None)
+    if step is None:
+        fraction, exponent = np.frexp(pixels.astype(np.float32))
+        return np.ldexp(np.round(fraction * 64) / 64, exponent).clip(-65504, 65504).astype(np.float16)
+    return (np.round(pixels / step) * step).clip(-65504, 65504).astype(np.float16)
+
+
 def compact(path: Path) -> None:
-    """Rewrite a file as half, without the second depth: a third of the size, for shots in a repository."""
+    """Rewrite a file as half, rounded, without the second depth: a fifth of the size, for shots in a repository."""
     source = OpenEXR.File(str(path), separate_channels=True)
     channels = {
-        name: OpenEXR.Channel(channel.pixels.clip(-65504, 65504).astype(np.float16))
+        name: OpenEXR.Channel(rounded(name, channel.pixels))
         for name, channel in source.channels().items()
         if "Denoising Depth" not in name
     }
@@ -205,7 +220,8 @@ def main(argv: list[str]) -> int:
         if options.reference_frames:
             first, last = map(int, options.reference_frames.split("-"))
             frames = range(first, last + 1)
-        render_level(scene, out, "reference", options.reference, frames, options.seed * 10 + 9)
+        name = "reference_a" if options.second_reference else "reference"
+        render_level(scene, out, name, options.reference, frames, options.seed * 10 + 9)
         if options.second_reference:
             render_level(scene, out, "reference_b", options.reference, frames, options.seed * 10 + 8)
     if options.compact:

@@ -11,6 +11,7 @@ from hybrid.files.replace import write_file
 
 Array = NDArray[np.float32]
 Image8 = NDArray[np.uint8]
+CELLS = 48
 
 
 def encode_srgb(linear: NDArray[Any]) -> Array:
@@ -28,6 +29,18 @@ def encode_filmic(linear: NDArray[Any]) -> Array:
     mixed = (0.85 * light + 0.15 * light.mean(axis=-1, keepdims=True)) ** 1.25
     k = 0.18**1.25 * (1 / 0.18 - 1)
     return encode_srgb(1 - k / (mixed + k))  # 1 for infinity
+
+
+def measure_middle_gray(light: NDArray[Any]) -> float:
+    """Light that is shown as middle gray, 0.18: the geometric mean of the lit cells of a finite picture (H, W, C).
+
+    A mean is that of windows and lamps where they are in view. There are at most `CELLS` a side, as the logarithm of
+    noise is no measure of light. 1 for a picture without light.
+    """
+    gray = np.maximum(light, 0).mean(axis=-1, dtype=np.float32, keepdims=True)
+    cells = fit(gray, CELLS)
+    lit = cells[cells > 0].astype(np.float64)
+    return float(np.exp(np.log(lit).mean())) if lit.size else 1.0
 
 
 # From 16 bits to 8; near black a step of 16 linear bits is a twentieth of a step of 8 sRGB bits.
@@ -48,6 +61,15 @@ def fit(picture: NDArray[Any], side: int) -> NDArray[Any]:
     scale = min(1.0, side / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
     return picture if scale == 1 else cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+
+
+def write_label(picture: Image8, text: str, *, right: bool = False) -> None:
+    """Write white text with a black rim, readable on any picture, into its lower left or right corner."""
+    font, size = cv2.FONT_HERSHEY_SIMPLEX, 0.45
+    (width, _), _ = cv2.getTextSize(text, font, size, 1)
+    at = picture.shape[1] - width - 6 if right else 6, picture.shape[0] - 8
+    for thickness, gray in ((3, 0), (1, 255)):
+        cv2.putText(picture, text, at, font, size, (gray, gray, gray), thickness, cv2.LINE_AA)
 
 
 def write_png(path: Path, picture: NDArray[Any]) -> None:

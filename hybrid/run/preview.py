@@ -7,12 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hybrid.alignment.transfer import measure_exposure
 from hybrid.files.movies import check_movie, write_movie
-from hybrid.files.png import Image8, encode_bytes, write_png
+from hybrid.files.png import Image8, encode_bytes, measure_middle_gray, write_label, write_png
 from hybrid.files.shots import Shot, output_path
 from nlm.average import replace_nonfinite
 
+LABELLED = 240  # pixels of width from which a preview has labels
 SHORTEST = 48  # frames of a movie; shorter shots are repeated
 SHEET_FRAMES, SHEET_WIDTH = 24, 320  # frames of a contact sheet at most, and pixels of their width
 
@@ -34,13 +34,13 @@ def check_png(path: Path, what: str) -> None:
 def write_preview(shot: Shot, output: str | Path, path: Path, *, rate: float = 24.0) -> None:
     """Write the middle frame as a .png, noisy left and denoised right, or a .mp4 or .webp with a moving divider.
 
-    Movies play at `rate` frames per second. All frames have one exposure, at which the middle noisy frame has a mean of
-    0.18, and are sRGB encoded.
+    Movies play at `rate` frames per second. All frames have one exposure, by `measure_middle_gray` of the middle noisy
+    frame, and are sRGB encoded.
     """
     check_preview(path)
     pairs = _Pairs(shot, output)
     if path.suffix.lower() == ".png":
-        noisy, denoised = pairs.read(shot.numbers[len(shot.numbers) // 2])
+        noisy, denoised = pairs.read_labelled(shot.numbers[len(shot.numbers) // 2])
         write_png(path, np.concatenate([noisy, denoised], axis=1) / 255)
     else:
         write_movie(path, _wipe(pairs, rate), rate)
@@ -59,10 +59,9 @@ def write_contact_sheet(shot: Shot, output: str | Path, path: Path) -> None:
     for index, number in enumerate(chosen):
         noisy, denoised = pairs.read(number)
         split = divide(noisy, denoised, 0.5)
-        small = cv2.resize(split, size, interpolation=cv2.INTER_AREA if width > size[0] else cv2.INTER_LINEAR)
-        for thickness, gray in ((3, 0), (1, 255)):  # white on black is readable on any picture
-            at, font = (6, size[1] - 8), cv2.FONT_HERSHEY_SIMPLEX
-            cv2.putText(small, str(number), at, font, 0.45, (gray, gray, gray), thickness, cv2.LINE_AA)
+        way = cv2.INTER_AREA if width > size[0] else cv2.INTER_LINEAR
+        small: Image8 = np.asarray(cv2.resize(split, size, interpolation=way), np.uint8)
+        write_label(small, str(number))
         top, left = index // columns * size[1], index % columns * size[0]
         sheet[top : top + size[1], left : left + size[0]] = small
     write_png(path, sheet / 255)
@@ -86,10 +85,18 @@ class _Pairs:
         self.noisy = shot
         self.denoised = shot.reopened({number: output_path(output, shot, number) for number in shot.numbers})
         middle, _ = replace_nonfinite(shot.reader.read_color(shot.numbers[len(shot.numbers) // 2]))
-        self._exposure = np.float32(measure_exposure(middle) / 0.18)
+        self._exposure = np.float32(measure_middle_gray(middle) / 0.18)
 
     def read(self, number: int) -> tuple[Image8, Image8]:
         return self._encoded(self.noisy, number), self._encoded(self.denoised, number)
+
+    def read_labelled(self, number: int) -> tuple[Image8, Image8]:
+        """A pair with the names of both in it, where there is room for them."""
+        noisy, denoised = self.read(number)
+        if noisy.shape[1] >= LABELLED:
+            write_label(noisy, "noisy")
+            write_label(denoised, "ravg", right=True)
+        return noisy, denoised
 
     def _encoded(self, shot: Shot, number: int) -> Image8:
         color, _ = replace_nonfinite(shot.reader.read_color(number))
@@ -102,7 +109,7 @@ def _wipe(pairs: _Pairs, rate: float) -> Iterator[Image8]:
     rounds = max(1, SHORTEST // len(numbers))
     total = rounds * len(numbers)
     sweeps = max(1, round(total / rate / 4))  # the divider's way from left to right and back takes four seconds
-    read = cache(pairs.read) if rounds > 1 else pairs.read
+    read = cache(pairs.read_labelled) if rounds > 1 else pairs.read_labelled
     for index in range(total):
         noisy, denoised = read(numbers[index % len(numbers)])
         yield divide(noisy, denoised, 0.5 + 0.5 * float(np.sin(2 * np.pi * sweeps * index / total)))

@@ -18,12 +18,12 @@ from hybrid.run.records import read_records
 from tests.exr_files import write_layers
 
 pytestmark = pytest.mark.reliability
-SHOT = Path(__file__).parents[2] / "examples" / "shot"
+SHOT = Path(__file__).parents[1] / "data" / "bathroom"
 FRAMES, REPEAT = 5, 12
 
 
 def tile_shot(folder: Path) -> None:
-    """Write five frames of the bundled shot, each tiled, as float32: half would hide or magnify small differences."""
+    """Write five frames of *bathroom*, each tiled, as float32: half would hide or magnify small differences."""
     for number, path in enumerate(sorted(SHOT.glob("noisy.*.exr"))[:FRAMES], start=1):
         image = read_exr(path)
         layers = {layer.name: np.tile(image.pixels(layer.channels), (REPEAT, REPEAT, 1)) for layer in image.layers}

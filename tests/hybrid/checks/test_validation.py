@@ -34,7 +34,7 @@ from tests.seldom import seldom
 FRAMES = truths()
 REFERENCE = open_shot(SHOT / "reference.0010.exr").read(10).color
 LIGHT = "ViewLayer.Combined"
-EXAMPLE = Path(__file__).parents[3] / "examples" / "shot"
+EXAMPLE = Path(__file__).parents[2] / "data" / "bathroom"
 
 
 def cycles(truth: Truth) -> Channels:

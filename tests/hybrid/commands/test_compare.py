@@ -229,10 +229,10 @@ def test_samples_of_a_level_come_from_its_files_or_are_asked_for(shots, tmp_path
     assert main([*words, "--level", str(noisy)]) == 1
     assert "does not state its samples per pixel, expected --level PATTERN=SPP" in capsys.readouterr().err
     bundled = Path(__file__).parents[3] / "examples" / "shot"
-    noisy, clean = bundled / "noisy.####.exr", bundled / "reference.####.exr"
+    noisy, clean = bundled / "noisy.####.exr", bundled / "reference_a.####.exr"
     words = ["compare", str(noisy), "--reference", str(clean), "--methods", "noisy", "--rounds", "1", "--frames", "11"]
     assert main([*words, "--level", str(bundled / "reference_b.####.exr"), "-o", str(tmp_path / "report")]) == 0
-    assert ", 512: " in results_of(tmp_path / "report").facts["Worth in samples"]
+    assert ", 96: " in results_of(tmp_path / "report").facts["Worth in samples"]
 
 
 def test_frames_are_kept_and_the_time_of_others_is_theirs_to_state(tmp_path: Path) -> None:

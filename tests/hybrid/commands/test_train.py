@@ -171,10 +171,10 @@ def test_levels_are_read_as_the_options_say(shot):
 
 
 def test_samples_are_read_from_cycles_headers():
-    _, levels, samples = open_levels("examples/shot", {"noisy": 24})
-    assert samples == [24]
+    _, levels, samples = open_levels("examples/shot", {"noisy": 16})
+    assert samples == [16]
     header = read_exr(levels["noisy"].path(8), pixels=False).parts[0].header
-    assert any(key.startswith("cycles.") for key in header) == (open_levels("examples/shot")[2] == [24])
+    assert any(key.startswith("cycles.") for key in header) == (open_levels("examples/shot")[2] == [16])
 
 
 @pytest.mark.parametrize("text", ["", "a", "a=", "a=0", "a=x", "=4", "a=4,,b=4"])

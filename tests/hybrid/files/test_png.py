@@ -2,8 +2,9 @@
 
 import cv2
 import numpy as np
+import pytest
 
-from hybrid.files.png import encode_bytes, encode_filmic, encode_srgb, write_png
+from hybrid.files.png import encode_bytes, encode_filmic, encode_srgb, measure_middle_gray, write_png
 
 
 def test_a_png_holds_the_srgb_values_in_their_order(tmp_path):
@@ -23,6 +24,23 @@ def test_the_table_of_8_bits_gives_what_the_formula_gives():
     # Half a step of 8 bits for rounding, and half of a table's step, a twentieth at most.
     assert np.abs(table - formula).max() < 0.5 + 0.03
     assert np.array_equal(table[0, [0, -1], 0], [0, 255])
+
+
+def test_middle_gray_is_that_of_the_room_and_not_of_its_window():
+    room = np.full((96, 192, 3), 0.2, np.float32)
+    lit = room.copy()
+    lit[:24, :48] = 40  # 32 times the mean of the room, on 6 % of it
+    assert lit.mean() > 10 * room.mean()
+    assert measure_middle_gray(room) == pytest.approx(0.2)
+    assert measure_middle_gray(lit) < 0.3
+    assert measure_middle_gray(1e3 * lit) == pytest.approx(1e3 * measure_middle_gray(lit), rel=1e-5)
+
+
+def test_middle_gray_is_not_that_of_noise():
+    dark, lights = np.zeros((192, 384, 3), np.float32), np.random.default_rng(1).random((192, 384)) < 0.25
+    dark[lights] = 0.8  # single samples of a light of 0.2
+    assert measure_middle_gray(dark) == pytest.approx(0.2, rel=0.05)
+    assert measure_middle_gray(np.zeros_like(dark)) == 1
 
 
 def test_filmic_keeps_middle_gray_the_order_of_light_and_highlights():

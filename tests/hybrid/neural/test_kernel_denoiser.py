@@ -16,7 +16,7 @@ STAGES = {"demodulate", "outliers", "warp"}
 
 def test_more_threshold_stays_closer_to_the_input_and_to_its_own_frame():
     """On a rendered shot, with a small network that takes no estimates: 150 steps on two other scenes."""
-    shot = open_shot("examples/shot/noisy.####.exr", frames="11")
+    shot = open_shot("tests/data/bathroom/noisy.####.exr", frames="11")
     window = FrameStream(shot, only(STAGES)).align(11)
     noisy = window.color[2] * window.modulation
     distances, weights_of_centre = [], []

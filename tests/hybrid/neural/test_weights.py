@@ -21,7 +21,7 @@ from network.robust_average import RobustAverage
 from nlm.average import robust_average
 from tests.seldom import seldom
 
-SHOT = Path(__file__).parents[3] / "examples" / "shot"
+SHOT = Path(__file__).parents[2] / "data" / "bathroom"
 FRAME = 11
 
 
@@ -50,7 +50,7 @@ def reference():
     return open_shot(SHOT / "reference.####.exr").read(FRAME).color
 
 
-def test_final_gains_what_is_promised_on_the_bundled_shot(reference):
+def test_final_gains_what_is_promised_on_the_bathroom(reference):
     aligned = window()
     gained = psnr(final(), reference)
     robust = psnr(robust_average(aligned.color, aligned.confidence) * aligned.modulation, reference)

@@ -11,7 +11,15 @@ from PIL import Image
 from hybrid.cli import main
 from hybrid.files.png import encode_srgb
 from hybrid.files.shots import open_shot
-from hybrid.run.preview import SHEET_WIDTH, SHORTEST, check_preview, divide, write_contact_sheet, write_preview
+from hybrid.run.preview import (
+    LABELLED,
+    SHEET_WIDTH,
+    SHORTEST,
+    check_preview,
+    divide,
+    write_contact_sheet,
+    write_preview,
+)
 from tests.commands import words_in
 from tests.scenes import Scene
 
@@ -45,6 +53,18 @@ def test_a_png_has_the_middle_frame_noisy_and_denoised(pair, tmp_path):
     assert picture.shape == (40, 112, 3)
     assert picture[5, 5] == pytest.approx(level(0.36), abs=1)
     assert picture[5, -5] == pytest.approx(level(0.9 * 0.36), abs=1)
+
+
+def test_a_preview_names_both_sides_where_there_is_room(tmp_path):
+    def flat(index, layers):
+        layers["ViewLayer.Combined"][:] = 0.18
+
+    folders = [Scene(height=40, width=LABELLED).write(tmp_path / name, edit=flat) for name in ("noisy", "denoised")]
+    write_preview(open_shot(folders[0]), folders[1], tmp_path / "a.png")
+    noisy, denoised = np.split(cv2.imread(str(tmp_path / "a.png")), 2, axis=1)
+    for side, here, there in ((noisy, slice(0, 80), slice(80, None)), (denoised, slice(-80, None), slice(0, -80))):
+        assert side[:, here].std() > 0
+        assert side[:, there].std() == 0
 
 
 def test_a_movie_plays_all_frames_with_one_exposure_and_a_divider_that_moves(pair, tmp_path):
