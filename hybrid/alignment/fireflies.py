@@ -67,14 +67,20 @@ class _Witnesses:
 
 
 def remove_fireflies(
-    frame: PreparedFrame, neighbour: Callable[[int], PreparedFrame | None], timings: Timings
+    frame: PreparedFrame,
+    neighbour: Callable[[int], PreparedFrame | None],
+    repeats_noise: Callable[[int], bool],
+    timings: Timings,
 ) -> PreparedFrame:
-    """Remove single bright samples and set highlights apart, by `neighbour`: frames at −2, −1, 1, 2, or None."""
+    """Remove single bright samples and set highlights apart, by `neighbour`: frames at −2, −1, 1, 2, or None.
+
+    `repeats_noise` says of these whether their noise is at equal pixels that of the next frame towards this one.
+    """
     with timings.stage("prepare"):
         places, isolated = find_bright_samples(frame.irradiance)
     if not len(places):
         return frame
-    highlights, alone = _find_highlights(frame, places, neighbour, timings)
+    highlights, alone = _find_highlights(frame, places, neighbour, repeats_noise, timings)
     with timings.stage("prepare"):
         rendered, fireflies = frame.irradiance, places[isolated & alone]
         if len(highlights.pixels):
@@ -91,7 +97,11 @@ def remove_fireflies(
 
 
 def _find_highlights(
-    frame: PreparedFrame, places: Places, neighbour: Callable[[int], PreparedFrame | None], timings: Timings
+    frame: PreparedFrame,
+    places: Places,
+    neighbour: Callable[[int], PreparedFrame | None],
+    repeats_noise: Callable[[int], bool],
+    timings: Timings,
 ) -> tuple[Highlights, Mask]:
     """Find which bright places are highlights, and which have nothing like them in the frames beside this one.
 
@@ -113,13 +123,14 @@ def _find_highlights(
         other = last[side] = neighbour(distance * side)
         if other is None:  # no motion leads to the frames behind it
             continue
+        held = repeats_noise(distance * side)
         with timings.stage("prepare"):
             motion = moved[side] = moved[side] + _motion(nearer, other, nearest_pixel(centre.points + moved[side]))
             fade = measure_fade(other.irradiance, frame.irradiance, frame.valid & other.valid)
             if (fade != 1).any():
                 other, equal = scaled(other, fade), NEAR
             lights = _lights_of(other, follow_motion(centre, motion), centre, fade)
-            fresh = _has_own_noise(frame, places, other.sampled, lights, motion, compared, equal)
+            fresh = _has_own_noise(frame, places, other.sampled, lights, motion, compared, equal, held)
             if distance == 1:
                 alone &= ~(fresh & recurs_nearby(places, frame.irradiance, lights.pixels, other.irradiance))
             tested = fresh & undecided
@@ -148,10 +159,13 @@ def _has_own_noise(
     motion: Points,
     compared: Sequence[tuple[Array, Points]],
     equal: float,
+    held: bool,
 ) -> Mask:
     """Return which places (K,) another frame `other` shows with samples that no frame of `compared` has.
 
     `compared` are those of others with the motion there; samples are the same up to a share `equal` of their value.
+    If noise is `held` at equal pixels, it is the same wherever motion is slow: the paths of one seed are alike though
+    their samples are not equal, and clamped ones are equally bright.
     """
     inside = np.isfinite(lights.light).all(axis=1)
     repeated = np.zeros(len(places), bool)
@@ -159,7 +173,7 @@ def _has_own_noise(
         repeated |= repeats(earlier, other, equal)
         unmoved = np.abs(motion - before).max(axis=1) < MOVED_NOISE
         if unmoved.any():
-            repeated |= unmoved & same_noise_at(*equal_noise(earlier, other, equal), lights.pixels)
+            repeated |= unmoved & (held or same_noise_at(*equal_noise(earlier, other, equal), lights.pixels))
     repeated &= inside
     if repeated.any():  # without noise they are no sample shown twice
         repeated[repeated] = ~noise_free_around(frame, places[repeated])

@@ -129,8 +129,9 @@ class PairFacts:
     changed: float  # share of the picture that changes at equal pixels by more than noise, in [0, 1]
     # share of the picture whose light changes along the vectors by more than noise; `changed` without vectors
     unexplained: float
-    # share of the noise that is fixed to the screen, in [-1, 1]: about 1 with one seed for all frames, else 0
-    fixed_noise: float
+    # share of the noise that is fixed to the screen, in [-1, 1]: about 1 with one seed for all frames, else 0; None if
+    # it is known of frames farther apart alone
+    fixed_noise: float | None
     guide_noise: float  # upper quartile of the difference of albedo and normal between the frames, along the vectors
     # share of the noise of albedo and normals in their variance at outlines (`flow.confidence.measure_share`); None
     # where it cannot be measured
@@ -267,8 +268,10 @@ def _guides(frame: PreparedFrame, neighbour: PreparedFrame) -> list[tuple[Array,
     return [(guide, other) for guide, other in pairs if guide is not None and other is not None]
 
 
-def fixed_noise(frame: PreparedFrame, neighbour: PreparedFrame, *, moves: bool, same: float = SAME) -> float:
-    """Measure the share of the noise of two neighbours that is the same at equal pixels, in [-1, 1]; 0 without noise.
+def fixed_noise(frame: PreparedFrame, neighbour: PreparedFrame, *, moves: bool, same: float = SAME) -> float | None:
+    """Measure the share of the noise of two frames that is the same at equal pixels, in [-1, 1]; 0 without noise.
+
+    None where most of it moves by less than half a pixel, as detail and noise then correlate alike.
 
     With `moves` the picture changes at equal pixels: without vectors, motion is then searched for.
 
@@ -299,7 +302,7 @@ def fixed_noise(frame: PreparedFrame, neighbour: PreparedFrame, *, moves: bool, 
         still = (length < slowest) & forth[1][block]
         both = forth[1][block] & back[1][block]
         moved, slow = both & (length > MOVED_NOISE), both & grainy & (length > slowest) & (length <= MOVED_NOISE)
-    shares, figures = [], []
+    shares, figures, unknown = [], [], 0
     compared = still & grainy
     if compared.any():
         shares.append(int(compared.sum()))
@@ -319,6 +322,9 @@ def fixed_noise(frame: PreparedFrame, neighbour: PreparedFrame, *, moves: bool, 
             at_equal, at_ends = (correlation(here[other], image[other]) for image in (there, along))
             shares.append(int(other.sum()))
             figures.append(max(at_equal - at_ends, 0.0))
+            unknown += int(slow.sum()) - shares[-1]
+    if unknown > sum(shares):
+        return None
     return float(np.clip(np.average(figures, weights=shares), -1, 1)) if any(shares) else 0.0
 
 

@@ -225,7 +225,7 @@ def measure_stages(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> 
         _decide("gate", unexplained, GATE_ABOVE, changes),
         # Samples show light that moves by less than the noise of a pixel, which no figure of this plan shows.
         _switch("drift", bool(pairs), neighbours),
-        _decide_fixed_noise([pair.fixed_noise for pair in pairs]),
+        _decide_fixed_noise([pair.fixed_noise for pair in pairs if pair.fixed_noise is not None]),
         prefilter,
         _decide_clean_guides(prefilter, least_outline_noise(pairs), [frame.samples for frame in frames]),
         _switch("stabilize", bool(pairs), neighbours),

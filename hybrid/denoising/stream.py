@@ -5,6 +5,7 @@
 
 import math
 from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import ClassVar, TypeVar, cast
@@ -18,6 +19,7 @@ from hybrid.alignment.fireflies import REACH, remove_fireflies
 from hybrid.alignment.flows import Flow, Link, PairFlows, compose_flows, measure_flows
 from hybrid.alignment.guides import GuideFilter
 from hybrid.alignment.measure import (
+    FIXED_NOISE_ABOVE,
     NO_FADE,
     Correlation,
     Fade,
@@ -314,7 +316,15 @@ class FrameStream:
             self._cache.pop(("read", (number,)), None)
         if "fireflies" not in self.rules.allowed:
             return rendered
-        return remove_fireflies(rendered, lambda k: self.rendered(number + k * self.shot.step), self.timings)
+
+        def other(distance: int) -> int:
+            return number + distance * self.shot.step
+
+        def repeats_noise(distance: int) -> bool:
+            nearer = distance - 1 if distance > 0 else distance + 1
+            return self.same_noise(*sorted((other(nearer), other(distance)))) > FIXED_NOISE_ABOVE
+
+        return remove_fireflies(rendered, lambda k: self.rendered(other(k)), repeats_noise, self.timings)
 
     def rendered(self, number: int) -> PreparedFrame | None:
         """A frame with its fireflies; None where the shot has none."""
@@ -351,10 +361,22 @@ class FrameStream:
 
     def same_noise(self, a: int, b: int) -> float:
         """The share of the noise of two neighbouring frames, ascending, that is the same at equal pixels."""
-        first, second = self.rendered(a), self.rendered(b)
-        assert first is not None
-        assert second is not None
-        return self._cached("same noise", (a, b), lambda *_: fixed_noise(first, second, moves=False))
+
+        def measure(*pair: int) -> float | None:
+            first, second = map(self.rendered, pair)
+            return None if first is None or second is None else fixed_noise(first, second, moves=False)
+
+        def search(*_: int) -> float:
+            found = measure(a, b)
+            # Slow motion reaches other pixels in more frames.
+            for distance in range(2 * self.shot.step, (REACH + 2) * self.shot.step, self.shot.step):
+                for pair in ((a, a + distance), (b - distance, b)):
+                    if found is None:
+                        with suppress(ValueError, OSError):  # of the other frame, whose own turn it is to fail
+                            found = measure(*pair)
+            return found or 0.0
+
+        return self._cached("same noise", (a, b), search)
 
     def _read(self, number: int) -> PreparedFrame:
         with self.timings.stage("read"):
@@ -391,7 +413,8 @@ class FrameStream:
 
         def measure(*_: int) -> PairFacts:
             with self.timings.stage("plan"):
-                return measure_pair(first, second, (self._small(a), self._small(b)))
+                facts = measure_pair(first, second, (self._small(a), self._small(b)))
+            return facts if facts.fixed_noise is not None else replace(facts, fixed_noise=self.same_noise(a, b))
 
         return self._cached("pair facts", (a, b), measure)
 
