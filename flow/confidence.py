@@ -8,7 +8,7 @@ from numba import njit
 
 from flow.warp import ends_inside, interpolate_row, locate_row, warp, weigh_whole
 from loops.decay import decay
-from loops.parallel import run_bands
+from loops.parallel import STRIP, run_bands
 
 # Difference of albedo (norm over channels) at which the confidence falls to 1/e.
 _ALBEDO_SIGMA = 0.1
@@ -34,8 +34,6 @@ _UNLIKELY = 40.0
 _LARGEST = np.float32(4)
 # Squared length of a normal on a surface: below a tenth of the samples on one, its direction is that of a stray sample.
 _SURFACE = np.float32(0.01)
-# Rows that are compared at a time, which stay in the caches.
-_STRIP = 32
 
 _Pair = tuple[np.ndarray, np.ndarray]
 
@@ -209,8 +207,8 @@ def find_coverage(flow: np.ndarray, valid: np.ndarray, measured: np.ndarray, fir
         share, inside = warp(measured, flow, first_row=first_row)
         return np.asarray(valid & inside & (share > np.float32(0.999)))
     covered = np.empty(valid.shape, np.bool_)
-    for top in range(0, len(flow), _STRIP):
-        rows = slice(top, top + _STRIP)
+    for top in range(0, len(flow), STRIP):
+        rows = slice(top, top + STRIP)
         covered[rows] = valid[rows] & ends_inside(flow[rows], measured.shape, first_row + top)
     return covered
 

@@ -6,11 +6,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from loops.parallel import STRIP
+
 _REC709 = np.array([0.2126, 0.7152, 0.0722], np.float32)
 # Radius of the guided filter of the luminance, pixels.
 _RADIUS = 2
-# Rows whose luminance is made at a time.
-_STRIP = 128
 
 
 def _luminance(
@@ -18,8 +18,8 @@ def _luminance(
 ) -> np.ndarray:
     """Luminance of (H, W, 3) + lift, not negative, and a function of it; NaN is 0. In strips: one plane is made."""
     found = np.empty(image.shape[:2], np.float32)
-    for top in range(0, len(found), _STRIP):
-        rows = slice(top, top + _STRIP)
+    for top in range(0, len(found), STRIP):
+        rows = slice(top, top + STRIP)
         with np.errstate(invalid="ignore", over="ignore"):
             strip = np.asarray(image[rows], np.float32)
             luminance = (strip + np.float32(lift) if lift else strip) @ _REC709

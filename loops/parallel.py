@@ -22,6 +22,9 @@ Doubles = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Places = NDArray[np.intp]
 
+# Rows that are processed at a time, which stay in the caches of a processor; running sums begin anew with each strip.
+STRIP = 64
+
 # Threads of a loop, for all callers; numba's own limit counts only for the thread that sets it.
 _count: int = config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
 

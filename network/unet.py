@@ -134,10 +134,6 @@ class Stage(nn.Sequential):
         for name in UpsampleTaps._fields:
             self.register_buffer(name, None, persistent=False)
 
-    def after_first(self, x: Tensor) -> Tensor:
-        """Run all layers behind the first convolution and its ReLU."""
-        return self._run(x, list(self)[2:])
-
     def upsample(self, x: Tensor, skip: Tensor) -> Tensor:
         """Enlarge features to twice their size, concatenate the skip connection, and run all layers."""
         first = cast(nn.Conv2d, self[0])

@@ -4,15 +4,13 @@ import cv2
 import numpy as np
 from numba import njit
 
-from loops.parallel import Floats, Mask, run_bands
+from loops.parallel import STRIP, Floats, Mask, run_bands
 
 # How many robust scales above the median an outlier lies.
 _FAR_ABOVE = np.float32(16)
 # How far beyond the limit two or four pixels together are no highlight either. The non-local means would smear them:
 # a 2×2 cluster of 1e6 left 1000 times the light three pixels away.
 _SPARK = np.float32(100)
-# Rows that are squared at a time, which stay in the caches.
-_STRIP = 32
 
 
 def average(window: Floats, weight: Floats) -> Floats:
@@ -80,9 +78,9 @@ def channel_mean(image: Floats) -> Floats:
 def mean_square(image: Floats) -> Floats:
     """Mean (H, W) over the channels of the square of an image (H, W, C)."""
     mean = np.empty(image.shape[:2], np.float32)
-    for top in range(0, len(image), _STRIP):
-        strip = image[top : top + _STRIP]
-        mean[top : top + _STRIP] = channel_mean(strip * strip)
+    for top in range(0, len(image), STRIP):
+        strip = image[top : top + STRIP]
+        mean[top : top + STRIP] = channel_mean(strip * strip)
     return mean
 
 

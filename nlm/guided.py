@@ -4,11 +4,9 @@ import cv2
 import numpy as np
 from numba import njit
 
-from loops.parallel import Doubles, Floats, run_bands
+from loops.parallel import STRIP, Doubles, Floats, run_bands
 from nlm.average import replace_nonfinite
 
-# Rows filtered with the same running sums.
-_STRIP = 64
 # Rows that are measured together, which stay in the caches in float64.
 _ROWS = 8
 
@@ -67,7 +65,7 @@ def guided_filter(
         small_image /= np.where(small_trust > 0, small_trust, np.float32(1))
     small_radius = max(radius // subsample, 1)
     size, channels, planes = small_guide.shape[:2], image.shape[2], guide.shape[2]
-    strips = -(-size[0] // _STRIP)
+    strips = -(-size[0] // STRIP)
     boxes, coefficients = (np.empty((*size, channels * planes + channels + 1), np.float32) for _ in range(2))
     run_bands(_solve, strips, small_image, small_guide, small_trust, small_radius, float(eps), boxes)
     run_bands(_sum_boxes, strips, boxes, small_radius, coefficients)
@@ -120,7 +118,7 @@ def _shrink(image: Floats, step: int) -> Floats:
 def _sum_boxes(first: int, last: int, values: Floats, radius: int, out: Floats) -> None:
     """Sum of (H, W, M) over the box around each pixel, cut at the frame's edge, for strips of rows."""
     for strip in range(first, last):
-        top, bottom = strip * _STRIP, min(strip * _STRIP + _STRIP, len(values))
+        top, bottom = strip * STRIP, min(strip * STRIP + STRIP, len(values))
         above, size = max(top - radius, 0), (2 * radius + 1, 2 * radius + 1)
         rows = values[above : bottom + radius]
         sums = cv2.boxFilter(rows, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
@@ -198,7 +196,7 @@ def _solve(
     H, W, C = image.shape
     G = guide.shape[2]
     for strip in range(first, last):
-        top, bottom = strip * _STRIP, min(strip * _STRIP + _STRIP, H)
+        top, bottom = strip * STRIP, min(strip * STRIP + STRIP, H)
         columns = np.zeros((W, 1 + G + G * (G + 1) // 2 + C + G * C))
         box = np.empty(columns.shape[1])
         matrix, right = np.empty((G, G)), np.empty((G, C))

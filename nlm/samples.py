@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from loops.parallel import Floats, Mask, run_bands
+from loops.parallel import STRIP, Floats, Mask, run_bands
 from nlm.average import channel_mean, check_colors, check_strip, check_window
 from nlm.cells import Axis, between_cells, cell_axis, cell_means
 from nlm.variance import gaussian_mean, ratio, second_differences
@@ -83,8 +83,6 @@ _LEFT = np.float32(1 - 1 / (4 * np.pi * _LIGHT**2))
 _RELIT = np.float32(2.25)
 # Albedo below that of any surface, by which light is divided in place of black.
 _BLACK = np.float32(1e-3)
-# Rows whose second differences are made at a time.
-_STRIP = 64
 # Cells per deviation of a mean.
 _CELLS = 4
 # Variance of a warped frame over that of a rendered one (`nlm.variance`).
@@ -281,8 +279,8 @@ def _energy_of(noisy: Floats, rate: Floats, picture: Floats | None, albedo: Floa
     The image is `noisy`, its difference from a picture, or its light; in strips, which stay in the caches.
     """
     energy = np.empty(rate.shape, np.float32)
-    for top in range(0, len(rate), _STRIP):
-        rows, bottom = slice(top, top + _STRIP), min(top + _STRIP, len(rate))
+    for top in range(0, len(rate), STRIP):
+        rows, bottom = slice(top, top + STRIP), min(top + STRIP, len(rate))
         outer = slice(max(top - 1, 0), bottom + 1)
         strip = noisy[outer] if picture is None else noisy[outer] - picture[outer]
         if albedo is not None:

@@ -14,7 +14,7 @@ from flow.warp import at_whole_pixels, warp
 from hybrid.alignment.prepare import PreparedFrame, rendered_flow, rough_light
 from hybrid.alignment.transfer import ALBEDO_FLOOR, NO_LIGHT, compress, measure_exposure, remodulate
 from hybrid.files.frame import Array
-from loops.parallel import Doubles, Mask, Places
+from loops.parallel import STRIP, Doubles, Mask, Places
 from nlm.average import channel_mean, reject_outliers
 from nlm.gate import color_gate
 from nlm.pixel_filter import measure_correlation
@@ -61,8 +61,6 @@ FIXED_NOISE_ABOVE = 0.2
 REPEATED = 0.99
 # Side of the area in which noise is compared around a pixel; the whole frame if fewer than `FEW` pixels hold noise.
 NOISE_AROUND, FEW = 33, 32
-# Rows that are compared at a time, until it is certain that a frame does not repeat another.
-NOISE_ROWS = 64
 # Pixels on each side in which `noise_free_around` looks for noise, the least number of lit ones, and the share of them
 # that lies on a line with its neighbours: of noise of 1 % a third does.
 AROUND, LIT, STRAIGHT = 16, 32, 0.9
@@ -403,9 +401,9 @@ def equal_noise(frame: Array, other: Array, same: float = SAME) -> tuple[Array, 
 def repeats(frame: Array, other: Array, same: float = SAME) -> bool:
     """Return whether a frame (H, W, 3) repeats another, by `equal_noise`; False if hardly any pixel has detail."""
     height, size, grainy, equal = len(frame), frame.shape[0] * frame.shape[1], 0, 0
-    for top in range(0, height, NOISE_ROWS):
+    for top in range(0, height, STRIP):
         # With the two rows on each side that a median of 5×5 pixels reads.
-        first, last = max(top - 2, 0), min(top + NOISE_ROWS, height)
+        first, last = max(top - 2, 0), min(top + STRIP, height)
         detail, alike = equal_noise(frame[first : last + 2], other[first : last + 2], same)
         grainy += int(np.count_nonzero(detail[top - first : last - first]))
         equal += int(np.count_nonzero(alike[top - first : last - first]))

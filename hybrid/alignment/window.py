@@ -13,13 +13,10 @@ from hybrid.alignment.flows import Link
 from hybrid.alignment.prepare import Brightness, PreparedFrame
 from hybrid.alignment.residual import Limited, warp_residual
 from hybrid.files.frame import Array
-from loops.parallel import Mask
+from loops.parallel import STRIP, Mask
 from nlm.pooling import PooledSamples, pool_samples
 from nlm.samples import SampleMean
 from nlm.variance import prefilter_noisy_rows, smooth_variance, variance_from_window
-
-# Rows of a strip of residuals: those of five frames fit the caches of a processor.
-STRIP = 64
 
 
 def _nothing() -> None:

@@ -15,8 +15,8 @@ from hybrid.denoising.oidn import HOLDS
 from hybrid.denoising.stream import FirstPass, can_refine, kept_planes
 from hybrid.files.layers import Layers
 from hybrid.files.shots import Shot
+from loops.parallel import STRIP
 
-STRIP = 64  # rows are taken in whole strips of the guided filter
 MIB = 2**20
 # Share of the limit that is planned for; the allocator rounds up, and does not return all memory at once: at 960×540
 # the peak is 4 % above the plan.
