@@ -11,7 +11,7 @@ from loops.decay import decay
 from loops.parallel import STRIP, run_bands
 
 # Difference of albedo (norm over channels) at which the confidence falls to 1/e.
-_ALBEDO_SIGMA = 0.1
+ALBEDO_SIGMA = 0.1
 # Squared difference of unit normals at which the confidence falls to 0: of a cosine of 0.8.
 _NORMAL_LIMIT = np.float32(0.4)
 # How much of the squared difference from a neighbour is subtracted from the variance around a pixel: three times what
@@ -337,7 +337,7 @@ def _agree(
             bent[x] = max(distance[y, x, 1] - whole * bend * outlines[y, x, 1], zero)
             near[x] &= max(distance[y, x, 0], distance[y, x, 1]) < _LARGEST
         for x in range(width):
-            weight = max(one - bent[x] / _NORMAL_LIMIT, zero) * decay(painted[x] / np.float32(_ALBEDO_SIGMA**2))
+            weight = max(one - bent[x] / _NORMAL_LIMIT, zero) * decay(painted[x] / np.float32(ALBEDO_SIGMA**2))
             out[y, x] = weight if near[x] & inside[y, x] else zero
 
 

@@ -22,9 +22,6 @@ LEAST = 0.02
 GOOD = 0.25
 # With an unknown scale other lengths are tried unless a plain one leaves less than this share.
 EXACT = 0.05
-# A convention overrules the stated one if it leaves less than this share of the stated one's cost; or, where no motion
-# explains much of the change (reflections, disocclusions), if the stated one explains less than this share of it.
-OVERRULES = 0.5
 # Vectors may span half a frame (a shutter of 180 degrees) or two, and point either way.
 SCALES = (1.0, -1.0, 2.0, -2.0, 0.5, -0.5)
 # Conventions whose vectors (their ninth decile) are shorter, pixels, or longer, picture widths, are not tried.
@@ -177,10 +174,13 @@ class _Trials:
         return bool(difference.mean() > CLEARLY * difference.std() / np.sqrt(len(difference)))
 
     def overrules(self, other: MotionConvention, stated: MotionConvention) -> bool:
-        """Whether another convention leaves half of what the stated one does, which else explains half as much."""
+        """Whether another convention leaves half of what the stated one does, or explains twice as much.
+
+        The latter where no motion explains much of the change: reflections, disocclusions.
+        """
         clearly = self.clearly_better(other, stated) and self.clearly_better(other, None)
         gain, stated_gain = (self.left(None) - self.left(reading) for reading in (other, stated))
-        return clearly and (self.left(other) <= OVERRULES * self.left(stated) or stated_gain <= OVERRULES * gain)
+        return clearly and (self.left(other) <= WORTH * self.left(stated) or stated_gain <= WORTH * gain)
 
     def confirm(self, reading: MotionConvention) -> bool:
         """Whether surfaces, which do not depend on light, confirm a convention."""

@@ -22,7 +22,7 @@ SCREENED = 192
 NOISE_SHARE, NOISE_FLOOR = 0.3, 0.004
 # A convention that moves more of the change out of the picture than it keeps explains nothing.
 INSIDE = 0.5
-# Vectors explain at least this share of the change that an estimated flow explains.
+# Vectors explain at least this share of the change that an estimated flow explains, or another convention.
 WORTH = 0.5
 # Frames that differ in a greater share of the picture may be two shots.
 CUT = 0.5

@@ -11,8 +11,7 @@ from loops.parallel import Floats, Mask, run_bands
 from nlm.average import check_colors, check_exposure, check_window, mean_square
 
 _MEAN_SIZE = (9, 9)
-_NOISE_SIZE = (15, 15)
-_AROUND_SIZE = (15, 15)
+AROUND_SIZE = (15, 15)
 _DETAIL_SIZE = (5, 5)
 # Boxes of the difference from the centre and of the scatter of the neighbours; Gaussians of the same deviations, 3 and
 # 6 pixels, are alike. 1.5 and 2 pixels for the first cost up to 0.25 dB on shots without misaligned detail.
@@ -83,7 +82,7 @@ def color_gates(
     both = np.empty(shape[:2], np.bool_)
     run_bands(_compare, shape[0], noisy, centre, np.float32(exposure), difference, both)
     # The running sums of a box filter round to a little below 0 where nothing differs.
-    noise = np.sqrt(np.maximum(cv2.blur(mean_square(difference), _NOISE_SIZE), 0))
+    noise = np.sqrt(np.maximum(cv2.blur(mean_square(difference), AROUND_SIZE), 0))
     rates = [1 / np.square(np.float32(share) * noise + np.float32(floor)) for share in shares]
     weights = [np.empty(estimates.shape[:3], np.float32) for _ in shares]
     for t, estimate in enumerate(estimates):
@@ -93,7 +92,7 @@ def color_gates(
             continue
         run_bands(_compare, shape[0], estimate, centre, np.float32(exposure), difference, both)
         mean = mean_square(np.asarray(cv2.blur(difference, _MEAN_SIZE), np.float32))
-        around = cv2.blur(mean, _AROUND_SIZE)
+        around = cv2.blur(mean, AROUND_SIZE)
         if detail is not None:
             energy = cv2.blur(mean_square(difference), _DETAIL_SIZE)
             around = np.maximum(around, energy / np.float32(detail**2))
@@ -147,7 +146,7 @@ def agreement_weight(estimates: Floats, noisy: Floats, confidence: Floats, expos
     excess, near = (cv2.blur(plane, _EXCESS_SIZE) for plane in (excess, trust))
     with np.errstate(divide="ignore", invalid="ignore"):  # where no neighbour is trusted
         count, variance = wide / repeat, np.maximum(spread, 0) / (wide - repeat)
-        error = excess / near - cv2.blur(noise, _NOISE_SIZE) - _SURE * variance * (1 + 1 / count)
+        error = excess / near - cv2.blur(noise, AROUND_SIZE) - _SURE * variance * (1 + 1 / count)
         known = (wide > _LEAST_COUNT * repeat) & (near > 0) & (error > 0)
         return np.where(known, variance / (variance + count * error), np.float32(1))
 

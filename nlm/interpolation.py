@@ -5,9 +5,7 @@ import numpy as np
 
 from loops.parallel import Floats
 from nlm.average import channel_mean, mean_square
-
-# Box, pixels, over which the noise of the samples is measured, as in `nlm.gate`.
-_NOISE_SIZE = (15, 15)
+from nlm.gate import AROUND_SIZE
 
 
 def measure_noise(noisy: Floats, estimate: Floats, exposure: float) -> Floats:
@@ -32,7 +30,7 @@ def measure_noise(noisy: Floats, estimate: Floats, exposure: float) -> Floats:
     """
     light = np.maximum(channel_mean(estimate), 0) + np.float32(exposure)
     # The running sums of a box filter round to a little below 0.
-    return np.asarray(light * np.maximum(cv2.blur(mean_square(noisy - estimate) / light, _NOISE_SIZE), 0), np.float32)
+    return np.asarray(light * np.maximum(cv2.blur(mean_square(noisy - estimate) / light, AROUND_SIZE), 0), np.float32)
 
 
 def interpolation_weight(warped: Floats, bilinear: Floats, variance: Floats) -> Floats:

@@ -14,7 +14,8 @@ from numba import njit
 from loops.parallel import STRIP, Floats, Mask, run_bands
 from nlm.average import channel_mean, check_colors, check_strip, check_window
 from nlm.cells import Axis, between_cells, cell_axis, cell_means
-from nlm.variance import gaussian_mean, ratio, second_differences
+from nlm.pooling import RESIDUAL_LIMIT as _LIMIT
+from nlm.variance import WARPED, gaussian_mean, ratio, second_differences
 
 # Deviations of its own noise that are subtracted from the detail that frames share. At 1, noise that looks like detail
 # costs up to 1.3 dB of a rendered shot at 8 samples.
@@ -43,8 +44,6 @@ _PIXELS = np.float32(4 * np.pi * _SIGMA**2)
 # Errors are relative to the light: the picture's mean over σ = 2 pixels plus this share of the exposure, as the eye
 # sees an error in the dark by its size, and not by its ratio.
 _DARK = 0.3
-# A relative error counts up to this: a firefly must not decide for all pixels around it.
-_LIMIT = np.float32(6)
 # (deviation in pixels, k, f, bins) of the Gaussians over which means are restored, where the square of a mean exceeds
 # k (1 + (f / N)²) times its variance, N the number of samples that make the noise: a variance from a few bright samples
 # is unknown itself. Without f a shot at 54 dB lost 2 dB to five fireflies; with f no shot at 8 to 512 samples loses
@@ -59,7 +58,7 @@ _STOPS = np.float32(6)
 _FEWEST = 60
 # Limit of the distance of a sample from the picture when means are compared, in units of the light. Limits of 20 to 200
 # restore the mean equally well; 6 leaves 1 % where lamps are small.
-_FAR = np.float32(20)
+FAR = np.float32(20)
 # This share of the surrounding mean is added to the light: black pixels have noise too.
 _SOFT = 0.05
 # Light beyond so many exposures is a highlight, and does not count in the mean of its surroundings.
@@ -82,11 +81,10 @@ _LEFT = np.float32(1 - 1 / (4 * np.pi * _LIGHT**2))
 # 2.5 a place of a wall without any became 70 % too bright, and with 4 a shot at 8 samples loses 0.05 dB.
 _RELIT = np.float32(2.25)
 # Albedo below that of any surface, by which light is divided in place of black.
-_BLACK = np.float32(1e-3)
+BLACK = np.float32(1e-3)
 # Cells per deviation of a mean.
 _CELLS = 4
-# Variance of a warped frame over that of a rendered one (`nlm.variance`).
-_WARPED = np.float32(0.7)
+_WARPED = np.float32(WARPED)
 
 
 class SampleMean(NamedTuple):
@@ -284,10 +282,10 @@ def _energy_of(noisy: Floats, rate: Floats, picture: Floats | None, albedo: Floa
         outer = slice(max(top - 1, 0), bottom + 1)
         strip = noisy[outer] if picture is None else noisy[outer] - picture[outer]
         if albedo is not None:
-            strip = strip / np.maximum(albedo[outer], _BLACK)
+            strip = strip / np.maximum(albedo[outer], BLACK)
         found = second_differences(np.ascontiguousarray(strip))[top - outer.start :]
         if albedo is not None:
-            found = found[: bottom - top] * np.maximum(albedo[rows], _BLACK)
+            found = found[: bottom - top] * np.maximum(albedo[rows], BLACK)
         found = found[: bottom - top] * rate[rows, :, None]
         energy[rows] = np.einsum("yxc,yxc->yx", found, found) / np.float32(36)  # the squares of the coefficients
     return energy
@@ -374,7 +372,7 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
 
 def _with_mean(picture: Floats, light: Floats, noisy: Floats, dark: np.float32) -> Floats:
     """Give a picture of a light (H, W) the mean of the whole frame's samples, as far as it is known."""
-    mean, reach = light.mean(dtype=np.float64), _FAR * (light + dark)
+    mean, reach = light.mean(dtype=np.float64), FAR * (light + dark)
     if not mean > 0:
         return picture
     difference = noisy - light
@@ -422,7 +420,7 @@ def _sum_differences(
         for y in rows.pixels[row * side : (row + 1) * side]:
             for column in range(sums.shape[2]):
                 for x in columns.pixels[column * side : (column + 1) * side]:
-                    scale, reach = weight[y, x], _FAR * light[y, x]
+                    scale, reach = weight[y, x], FAR * light[y, x]
                     red = noisy[y, x, 0] - picture[y, x, 0]
                     green = noisy[y, x, 1] - picture[y, x, 1]
                     blue = noisy[y, x, 2] - picture[y, x, 2]

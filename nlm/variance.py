@@ -15,7 +15,7 @@ from nlm.nonlocal_means import BAND, joint_nlm
 _CAP = 16.0
 # Variance of a bilinearly warped frame over the centre's: the mean of (2/3)² (any fraction of a pixel along
 # both axes), 2/3 (along one) and 1 (none). It counts only where side frames are few.
-_WARPED = 0.7
+WARPED = 0.7
 # Variance of guides without noise: deviations of a thousandth of their range. In tiles with no more the filter would
 # change 1e-4 (RMS, five shots).
 _NOISELESS = np.float32(1e-6)
@@ -183,4 +183,4 @@ def _centre_deviation(
                     if t != centre and confidence[t, y, x] > 0:
                         mean += confidence[t, y, x] * window[t, y, x, c]
                 difference = window[centre, y, x, c] - mean / total
-                deviation[y, x, c] = difference**2 / (1 + np.float32(_WARPED) * squares / (total * total))
+                deviation[y, x, c] = difference**2 / (1 + np.float32(WARPED) * squares / (total * total))

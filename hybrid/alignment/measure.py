@@ -7,8 +7,9 @@ from typing import Self
 import cv2
 import numpy as np
 
-from flow.confidence import compare_guides, find_coverage, local_variance, measure_share, outline_variance
+from flow.confidence import ALBEDO_SIGMA, compare_guides, find_coverage, local_variance, measure_share, outline_variance
 from flow.guide import tone_map
+from flow.patches import CUT
 from flow.tvl1 import rough_flow
 from flow.warp import at_whole_pixels, warp
 from hybrid.alignment.prepare import PreparedFrame, rendered_flow, rough_light
@@ -18,6 +19,8 @@ from loops.parallel import STRIP, Doubles, Mask, Places
 from nlm.average import channel_mean, reject_outliers
 from nlm.gate import color_gate
 from nlm.pixel_filter import measure_correlation
+from nlm.pooling import RESIDUAL_LIMIT
+from nlm.samples import BLACK
 from nlm.variance import second_differences
 
 # Rows to which frames are reduced for measuring: a mean of k×k pixels has a k-th of their noise, and a k²-th of their
@@ -25,8 +28,9 @@ from nlm.variance import second_differences
 SHORT_SIDE = 270
 # Side of the crop in which fixed noise is measured: enough pixels to detect a correlation of 0.02.
 CROP = 512
-# Pixels of motion below which a pixel is static, and above which its noise is that of another pixel.
-STILL_NOISE, MOVED_NOISE = 0.05, 1.5
+# Pixels of motion below which a pixel is static, and above which its noise is that of another pixel: a bilinear sample
+# loses less than 1 % of its contrast up to the first, and hardly shares the noise beyond the second.
+STILL, MOVED_NOISE = 0.05, 1.5
 # Neighbouring half floats differ by at least 2^-11 of their value, and by at most 2^-10: values that differ by less
 # than the first are the same sample, those up to the second are so near by chance.
 SAME, NEAR = 2.0**-12, 2.0**-10
@@ -37,15 +41,12 @@ GRAIN = 4 * NEAR
 # Means of 9×9 pixels of guides that differ by more, in units of albedo, show other surfaces; depth of field leaves
 # noise of 0.05 in a pixel, and a tenth of it in these means.
 GUIDE_CHANGE = 0.02
-# Guides of a pixel that differ by more, in units of albedo, show other surfaces, or more noise than the light has.
-SAME_SURFACE = 0.1
-# Every so many rows are looked at for noise of a frame: all take a tenth of a second at 1920×1080.
-GRAIN_ROWS = 16
-# Pixels of such a row whose noise is compared together, and the ratio of samples from which on two frames differ in
-# them: by this measure frames of equal samples differ by up to 1.7, and those of four times as many by 1.9 to 8.4.
-GRAIN_COLUMNS, UNEQUAL = 16, 3.0
-# Rows that are compared together for noise of guides at outlines, of `SmallFrame.factor` times as many.
-OUTLINE_ROWS = 16
+# Side of the places in which noise of a frame is measured, by one row of each: all take a tenth of a second at
+# 1920×1080. Outlines are compared in so many rows of `SmallFrame.factor` times as many.
+PLACE = 16
+# Ratio of samples from which on two frames differ in these places: by this measure frames of equal samples differ by up
+# to 1.7, and those of four times as many by 1.9 to 8.4.
+UNEQUAL = 3.0
 # Share of the picture that must move by whole pixels for that: 1.6 % of vectors of any length end there by chance.
 WHOLE_PIXELS = 0.05
 # Areas whose means show changes that noise hides in 9×9 pixels: they must differ by more than a twentieth, and by eight
@@ -59,21 +60,14 @@ LIGHT_AROUND = 8.0
 FIXED_NOISE_ABOVE = 0.2
 # A frame repeats another where at least this share is equal: all but burned-in text.
 REPEATED = 0.99
-# Side of the area in which noise is compared around a pixel; the whole frame if fewer than `FEW` pixels hold noise.
-NOISE_AROUND, FEW = 33, 32
-# Pixels on each side in which `noise_free_around` looks for noise, the least number of lit ones, and the share of them
-# that lies on a line with its neighbours: of noise of 1 % a third does.
-AROUND, LIT, STRAIGHT = 16, 32, 0.9
+# Fewer pixels show nothing of noise.
+FEW = 32
+# Pixels on each side in which noise is looked for, and the share of lit ones without it that lies on a line with its
+# neighbours: of noise of 1 % a third does.
+AROUND, STRAIGHT = 16, 0.9
 TOGETHER = 256  # places that are looked at together: the pixels around all at once would take gigabytes
-# Albedo below that of any surface, by which light is divided in place of black.
-BLACK = np.float32(1e-3)
 # A tile that differs from its smoothed version by less than this, relative to exposure, has no noise.
 NOISE_FREE = 1e-4
-TILE = 32
-# Neighbours are a cut where more than this share of the picture changes, at equal pixels and along the vectors, and
-# optical flow leaves more than this share of the change. A change of light does as much, but leaves the guides as they
-# are: along the vectors 0.04 to 0.36 of them changed, at a cut 0.7 to 0.96.
-CUT = 0.5
 # Rows and columns of areas over the lit part: their medians average noise.
 AREAS = 4, 6
 # Greatest share of the changes that a factor of the whole picture leaves in three quarters of the areas, and that of a
@@ -88,9 +82,9 @@ LEAST_FADE, LEAST_AREAS = 0.01, 6
 # A factor is certain beyond so many errors: the upper quartile of what it leaves in N areas, over √N. On rendered shots
 # of 8 to 512 samples without a fade it is at most 4.9 of them.
 KNOWN = 6.0
-# Noise counts up to this relative error, and explains what is left up to so many standard errors of an area: without a
-# fade 0.6 to 1.5 of them are left where light stands still, and 2 to 20 where it moves.
-FIREFLY, EXPLAINED = 6.0, 2.0
+# Noise explains what is left up to so many standard errors of an area: without a fade 0.6 to 1.5 of them are left where
+# light stands still, and 2 to 20 where it moves.
+EXPLAINED = 2.0
 
 
 #: Correlation of the noise along x and along y, each at 1 to 4 pixels.
@@ -242,7 +236,11 @@ def _is_cut(
     smalls: tuple[SmallFrame, SmallFrame],
     vectors: tuple[Array, Mask] | None,
 ) -> bool:
-    """Whether neither vectors nor optical flow connect two frames that differ much."""
+    """Whether neither vectors nor optical flow connect two frames that differ much.
+
+    A change of light does as much, but leaves the guides as they are: along the vectors 0.04 to 0.36 of them changed,
+    at a cut 0.7 to 0.96.
+    """
     shown = smalls[0].textured(), smalls[1].textured()
     if vectors is not None and _changed(*shown, _reduced(vectors, smalls[0])) <= CUT:
         return False
@@ -288,7 +286,7 @@ def fixed_noise(frame: PreparedFrame, neighbour: PreparedFrame, *, moves: bool, 
     floor = 0.01 * measure_exposure(level[..., None])
     noise = [_high_pass(image / (level + floor)) for image in (a, b)]
     grainy = np.minimum(np.abs(noise[0]), np.abs(noise[1])) > GRAIN
-    forth, back, slowest = rendered_flow(frame, neighbour), rendered_flow(neighbour, frame), STILL_NOISE
+    forth, back, slowest = rendered_flow(frame, neighbour), rendered_flow(neighbour, frame), STILL
     if (forth is None or back is None) and moves:
         # Optical flow is exact to some tenths of a pixel: slower motion may be none, and static pixels must be equal.
         forth, back = _search(frame.radiance, neighbour.radiance), _search(neighbour.radiance, frame.radiance)
@@ -357,7 +355,7 @@ def noise_correlation(frame: PreparedFrame, neighbour: PreparedFrame) -> Correla
         rows, columns = rows.clip(0, height - 1), columns.clip(0, width - 1)
     compared &= neighbour.valid[rows, columns]
     for guide, other in _guides(frame, neighbour):
-        compared &= np.abs(guide[block] - other[rows, columns]).max(axis=-1) < SAME_SURFACE
+        compared &= np.abs(guide[block] - other[rows, columns]).max(axis=-1) < ALBEDO_SIGMA
     first, second = frame.irradiance[block], neighbour.irradiance[rows, columns]
     lit = (np.minimum(first, second) > 0).all(axis=-1) & compared
     ratios = np.log(first, where=lit[..., None], out=np.zeros_like(first))
@@ -438,7 +436,7 @@ def noise_free_around(frame: PreparedFrame, places: Places) -> Mask:
             lit[some] = (centre > 0).sum(axis=(1, 2))
             count = ((centre > 0) & (off <= 2 * NEAR * centre)).sum(axis=(1, 2))
             straight[some] = np.maximum(straight[some], count)
-    return np.asarray((lit >= LIT) & (straight >= STRAIGHT * lit))
+    return np.asarray((lit >= FEW) & (straight >= STRAIGHT * lit))
 
 
 def _is_noise_free(frame: PreparedFrame) -> bool:
@@ -452,7 +450,7 @@ def same_noise_at(grainy: Array, equal: Array, pixels: Places) -> Mask:
     """Return whether two frames, by `equal_noise`, have the same noise around each of some pixels, (K,) bool."""
     share = float(equal.sum() / max(grainy.sum(), 1))
     rows, columns = (np.clip(pixels[:, axis], 0, grainy.shape[axis] - 1) for axis in (0, 1))
-    side = (NOISE_AROUND, NOISE_AROUND)
+    side = (2 * AROUND + 1, 2 * AROUND + 1)
     count, same = (cv2.boxFilter(m, -1, side, normalize=False)[rows, columns] for m in (grainy, equal))
     return np.asarray(np.where(count >= FEW, same / np.maximum(count, 1), share) > FIXED_NOISE_ABOVE)
 
@@ -533,7 +531,7 @@ def _choose_factors(
 def _median_error(noise: Array, light: Array, lit: Mask, cells: Sequence[tuple[Places, ...]]) -> float:
     """Median over areas of the standard error of a change by noise (H, W, C) of this light."""
     relative = np.abs(noise) / np.maximum(light, np.float32(NO_LIGHT))
-    squares = np.square(np.minimum(relative, np.float32(FIREFLY))).mean(axis=2)
+    squares = np.square(np.minimum(relative, RESIDUAL_LIMIT)).mean(axis=2)
     errors = [np.sqrt(2 * np.mean(squares[cell][lit[cell]]) / np.count_nonzero(lit[cell])) for cell in cells]
     return float(np.median(errors))
 
@@ -679,8 +677,8 @@ def _outline_noise(
         return None
     others = {f"other_{name}": other for name, (_, other) in both.items()}
     bands: list[tuple[Array, Array, Mask]] = []
-    for top in range(0, len(frame.valid), factor * OUTLINE_ROWS):
-        rows = slice(top, top + OUTLINE_ROWS)
+    for top in range(0, len(frame.valid), factor * PLACE):
+        rows = slice(top, top + PLACE)
         guides = {name: guide[rows] for name, (guide, _) in both.items()}
         flow, valid = (layer[rows] for layer in vectors)
         inside = find_coverage(flow, valid, neighbour.valid, top) & at_whole_pixels(flow)
@@ -691,7 +689,7 @@ def _outline_noise(
 
 
 def _guide_grain(guides: Sequence[Array]) -> float | None:
-    """Upper quartile of the second differences of guides (H, W, C) in every `GRAIN_ROWS`-th row."""
+    """Upper quartile of the second differences of guides (H, W, C) in every `PLACE`-th row."""
     if not guides:
         return None
     grain, shown = np.zeros(1, np.float32), np.zeros(1, bool)
@@ -711,7 +709,7 @@ def _alpha_grain(alpha: Array) -> float:
 
 
 def _noise(light: Array) -> float:
-    """Median of the second differences of lit pixels, relative to the light, in every `GRAIN_ROWS`-th row."""
+    """Median of the second differences of lit pixels, relative to the light, in every `PLACE`-th row."""
     bent, level = (part.mean(axis=-1) for part in _second_differences(light))
     lit = level > 0
     return float(np.median(np.abs(bent[lit]) / level[lit])) if lit.any() else 0.0
@@ -724,7 +722,7 @@ def _samples_ratio(earlier: PreparedFrame, later: PreparedFrame) -> float:
     noises = []
     for frame in (earlier, later):
         change, level = (
-            np.add.reduceat(part.mean(axis=-1), np.arange(0, part.shape[1], GRAIN_COLUMNS), axis=1)
+            np.add.reduceat(part.mean(axis=-1), np.arange(0, part.shape[1], PLACE), axis=1)
             for part in map(np.abs, _second_differences(frame.irradiance))
         )
         noises.append(np.divide(change, level, out=np.zeros_like(change), where=level > 0))
@@ -738,7 +736,7 @@ def _samples_ratio(earlier: PreparedFrame, later: PreparedFrame) -> float:
 
 def _second_differences(layer: Array) -> tuple[Array, Array]:
     """Second differences, in units of the noise, and means of 3×3 pixels, in some rows of a layer (H, W, C)."""
-    rows = np.arange(1, len(layer) - 1, GRAIN_ROWS)[:, None] + np.arange(-1, 2)  # with one on each side
+    rows = np.arange(1, len(layer) - 1, PLACE)[:, None] + np.arange(-1, 2)  # with one on each side
     if not rows.size:
         return layer[:0], layer[:0]
     strips = layer[rows.ravel()]
@@ -782,7 +780,7 @@ def _needed(places: Array, size: int) -> tuple[int, int]:
 def _noise_free_share(small: SmallFrame) -> float:
     exposure = measure_exposure(small.light)
     removed = np.abs(compress(small.irradiance, exposure) - compress(small.light, exposure)).max(axis=-1)
-    side = max(TILE // small.factor, 1)
+    side = max(2 * AROUND // small.factor, 1)
     for axis, length in enumerate(removed.shape):
         removed = np.maximum.reduceat(removed, np.arange(0, length, side), axis=axis)
     return float(np.mean(removed < NOISE_FREE))

@@ -7,6 +7,7 @@ from numba import njit
 
 from flow.confidence import GuideNoise, estimate_confidence, find_coverage
 from hybrid.alignment.flows import Link
+from hybrid.alignment.measure import MOVED_NOISE
 from hybrid.alignment.prepare import PreparedFrame
 from hybrid.alignment.window import Geometry
 from hybrid.files.frame import Array
@@ -16,9 +17,9 @@ from loops.parallel import run_bands
 # each frame, flicker most. It gains 0.1 to 0.2 dB, and 1 dB in time, at 16 to 32 samples; 1 and 2 dB at 6 to 10, where
 # 0.5 gains more.
 AGREEING = 0.3
-# With one seed for all frames a neighbour has the centre's noise up to the first motion, and its own from the second
-# on, pixels: a bilinear sample half a pixel away shares the noise, one and a half pixels away hardly.
-SAME_NOISE, OTHER_NOISE = 0.5, 1.5
+# With one seed for all frames a neighbour has the centre's noise up to this motion, pixels, and its own from
+# `MOVED_NOISE` on.
+SAME_NOISE = 0.5
 
 
 def confidence_by_geometry(
@@ -47,7 +48,7 @@ def confidence_by_geometry(
 def novelty_of(flow: Array) -> Array:
     """Share of a neighbour's noise that is its own where all frames have one seed, in [0, 1], by its motion."""
     distance = np.hypot(flow[..., 0], flow[..., 1])
-    return np.clip((distance - SAME_NOISE) / (OTHER_NOISE - SAME_NOISE), 0, 1)
+    return np.clip((distance - SAME_NOISE) / (MOVED_NOISE - SAME_NOISE), 0, 1)
 
 
 def combine_confidence(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from flow.convention import SCALES, Choice, Trial, choose_convention
 from flow.guide import median_luminance, tone_map
 from flow.patches import FramePair, Patches
-from hybrid.alignment.measure import correlation
+from hybrid.alignment.measure import SHORT_SIDE, correlation
 from hybrid.checks.grade import Grade, find_grade
 from hybrid.checks.pass_sums import classify_passes, sample_rows
 from hybrid.files.frame import Array, Frame
@@ -35,8 +35,8 @@ Mask = NDArray[np.bool_]
 # not depend on the chunk that a frame comes in.
 PAIRS = 2
 LARGE = 2**24  # pixels above which the frames of these pairs lie in temporary files: four of 7680×4320 take 7 GiB
-# Rows for shares and bounds, and for the comparison of edges; larger frames are reduced to about so many.
-THIN, EDGE_ROWS = 270, 540
+# Rows for the comparison of edges; larger frames are reduced to about so many.
+EDGE_ROWS = 2 * SHORT_SIDE
 # A layer whose values lie within this of each other, relative to the largest, is constant: half floats round by 5e-4.
 SAME = 1e-3
 STRAY = 0.01  # share of pixels beyond its range that a layer may have: filters with negative lobes overshoot at edges
@@ -355,8 +355,8 @@ def _motion_findings(layers: Layers, choice: Choice) -> Iterator[Finding]:
 
 
 def _thin(frame: Frame) -> Frame:
-    """Every n-th row and column of a frame: shares and bounds need no more than `THIN` rows."""
-    step = max(1, min(frame.color.shape[:2]) // THIN)
+    """Every n-th row and column of a frame: shares and bounds need no more than `SHORT_SIDE` rows."""
+    step = max(1, min(frame.color.shape[:2]) // SHORT_SIDE)
     roles = ("color", *_CHECKS)
     layers = {role: layer[::step, ::step] for role in roles if (layer := getattr(frame, role)) is not None}
     return Frame(frame.number, **layers)
@@ -378,12 +378,12 @@ def _shrink(layer: Array) -> Array:
     factor = max(1, min(layer.shape[:2]) // EDGE_ROWS)
     width, height = layer.shape[1] // factor, layer.shape[0] // factor
     small = np.empty((height, width, layer.shape[2]), np.float32)
-    for top in range(0, height, THIN):  # in strips: frames are large
-        rows = layer[top * factor : min(top + THIN, height) * factor, : width * factor]
+    for top in range(0, height, SHORT_SIDE):  # in strips: frames are large
+        rows = layer[top * factor : min(top + SHORT_SIDE, height) * factor, : width * factor]
         clean = np.where(np.isfinite(rows), rows, np.float32(0))
         size = width, len(rows) // factor
         reduced = clean if factor == 1 else cv2.resize(clean, size, interpolation=cv2.INTER_AREA)
-        small[top : top + THIN] = reduced.reshape(-1, width, layer.shape[2])
+        small[top : top + SHORT_SIDE] = reduced.reshape(-1, width, layer.shape[2])
     return small
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybrid.alignment.measure import FIXED_NOISE_ABOVE, Correlation, FrameFacts, PairFacts, least_outline_noise
+from hybrid.alignment.measure import FIXED_NOISE_ABOVE, STILL, Correlation, FrameFacts, PairFacts, least_outline_noise
 from hybrid.files.sequences import format_frames
 
 #: Stages by name, in order. A figure calls for some; others (`_switch`) run wherever their input is there.
@@ -44,7 +44,6 @@ WHITEN_ABOVE = 0.13
 # The mean of that of pixels three and four apart: 0.02 by the filters of renderers, 0.05 by wider ones that can be
 # undone in part, 0.07 in frames of 80 pixels; errors of denoised pictures have 0.12 and more.
 WHITEN_BELOW = 0.09
-STILL = 0.05  # motion below a twentieth of a pixel blurs a bilinear sample by less than 1 % of its contrast
 # Share of pixels, in areas of 9×9, whose brightness the vectors do not explain. To change them is worth its time for
 # reflections and shadows of some size; the gate is cheap and already pays for a small highlight.
 UNEXPLAINED_ABOVE = 0.01

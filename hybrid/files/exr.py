@@ -31,7 +31,7 @@ from hybrid.runtime.streams import open_standard_streams
 # hundred-byte file which claims to be 2^31 pixels wide is refused before anything is allocated.
 MAX_PIXELS = 2**28
 
-HALF_MAX = 65504.0
+HALF_MAX = float(np.finfo(np.float16).max)
 # Compressions that change values each time they are written; PXR24 does not change values that it has written.
 _LOSSY = {"B44_COMPRESSION", "B44A_COMPRESSION", "DWAA_COMPRESSION", "DWAB_COMPRESSION", "LJ2K_COMPRESSION"}
 _MAGIC = b"\x76\x2f\x31\x01"

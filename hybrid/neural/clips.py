@@ -22,13 +22,12 @@ from hybrid.neural.tiling import image_of, tensor_of
 from hybrid.neural.unet_denoiser import clean_guides, gain_of
 from network.training.clips import Clip, importance, important_places, write_shards
 from nlm.average import replace_nonfinite
+from nlm.samples import FAR
 from nlm.variance import gaussian_mean
 
 # Deviation, pixels, of the Gaussian over which targets get the mean of a render: where the noise of 64 samples is a
 # fifth of the light, that of 450 pixels is a hundredth.
 _SIGMA = 6.0
-# A pixel of the render counts up to this many times the light around it, lest a firefly brighten 450 pixels.
-_FAR = np.float32(20)
 # This share of the exposure is added to both means: black stays black, and noise in the dark decides nothing.
 _DARK = np.float32(0.01)
 
@@ -134,7 +133,7 @@ def _with_means(image: Array, render: Array) -> Array:
     """
     dark = _DARK * measure_exposure(image)
     light = gaussian_mean(image, _SIGMA) + dark
-    limited = np.clip(render, 0, _FAR * light)
+    limited = np.clip(render, 0, FAR * light)
     factor = (gaussian_mean(limited, _SIGMA) + dark) / light
     return np.asarray(image * np.clip(factor, np.float32(0.5), np.float32(2)), np.float32)
 

@@ -26,7 +26,7 @@ FORMAT = "ravg-clips"
 VERSION = "4"
 #: Radiance is stored over the clip's exposure, in float16: normal numbers from 6e-5 to this, to which brighter values
 #: (fireflies only) are clipped.
-HALF_MAX = 65504.0
+HALF_MAX = torch.finfo(torch.float16).max
 RENDERS = ("noisy", "rendered")  # kinds of targets that are renders, whose noise is independent of the input's
 SHARD_BYTES = 1 << 28  # bytes after which a shard is full: small enough to copy about, large enough that files are few
 
