@@ -11,7 +11,7 @@ from flow.confidence import ALBEDO_SIGMA, compare_guides, find_coverage, local_v
 from flow.guide import tone_map
 from flow.patches import CUT
 from flow.tvl1 import rough_flow
-from flow.warp import at_whole_pixels, warp
+from flow.warp import at_whole_pixels, warp, warp_block
 from hybrid.alignment.prepare import PreparedFrame, rendered_flow, rough_light
 from hybrid.alignment.transfer import ALBEDO_FLOOR, NO_LIGHT, compress, measure_exposure, remodulate
 from hybrid.files.frame import Array
@@ -159,10 +159,6 @@ class SmallFrame:
         return self if fade == NO_FADE else replace(self, irradiance=irradiance, light=light)
 
 
-# `cv2.remap`, faster than `flow.warp`, refuses images of more pixels on a side.
-REMAPPED = 32766
-
-
 def shrink(frame: PreparedFrame) -> SmallFrame:
     """Reduce a frame to about `SHORT_SIDE` rows."""
     height, width = frame.irradiance.shape[:2]
@@ -306,8 +302,11 @@ def fixed_noise(frame: PreparedFrame, neighbour: PreparedFrame, *, moves: bool, 
         chance = max(_equal_share(a, np.roll(b, APART, axis=1), compared, same), 0)
         figures.append((_equal_share(a, b, compared, same) - chance) / max(1 - chance, LEAST_UNEQUAL))
     if moved.sum() > CROP and forth is not None and back is not None:
-        d_a = a - channel_mean(_warp_block(neighbour.sampled, forth[0], block))
-        d_b = b - channel_mean(_warp_block(frame.sampled, back[0], block))
+        corner = block[0].start, block[1].start
+        d_a, d_b = (
+            here - channel_mean(warp_block(np.ascontiguousarray(other), np.ascontiguousarray(flow[block]), corner)[0])
+            for here, other, (flow, _) in ((a, neighbour.sampled, forth), (b, frame.sampled, back))
+        )
         d = [_high_pass(image / (level + floor))[moved] for image in (d_a, d_b)]
         shares.append(int(moved.sum()))
         figures.append(2 * correlation(*d))
@@ -315,10 +314,11 @@ def fixed_noise(frame: PreparedFrame, neighbour: PreparedFrame, *, moves: bool, 
         for here, there, (flow, _) in ((noise[0], noise[1], forth), (noise[1], noise[0], back)):
             along, other = _at_ends(there, flow[block])
             other &= slow
-            at_equal, at_ends = (correlation(here[other], image[other]) for image in (there, along))
-            shares.append(int(other.sum()))
-            figures.append(max(at_equal - at_ends, 0.0))
-            unknown += int(slow.sum()) - shares[-1]
+            if other.any():
+                at_equal, at_ends = (correlation(here[other], image[other]) for image in (there, along))
+                shares.append(int(other.sum()))
+                figures.append(max(at_equal - at_ends, 0.0))
+            unknown += int(slow.sum()) - int(other.sum())
     if unknown > sum(shares):
         return None
     return float(np.clip(np.average(figures, weights=shares), -1, 1)) if any(shares) else 0.0
@@ -636,11 +636,15 @@ def _guide_noise(
     frame: PreparedFrame, neighbour: PreparedFrame, vectors: tuple[Array, Mask] | None, factor: int
 ) -> float:
     """Upper quartile of guide differences over every `factor`-th pixel; reduced guides would have less noise."""
-    grid = slice(factor // 2, None, factor), slice(factor // 2, None, factor)
+    grid = slice(factor // 2, None, factor)
     differences = []
     for guide, other in _guides(frame, neighbour):
-        warped = other[grid] if vectors is None else _warp_block(other, vectors[0], grid)
-        differences += [*np.moveaxis(np.abs(guide[grid] - warped), -1, 0)]
+        moved = other[grid]
+        if vectors is not None:
+            whole = np.ascontiguousarray(other)
+            rows = enumerate(vectors[0][grid, None])
+            moved = np.concatenate([warp_block(whole, row, (factor // 2 + n * factor, 0))[0] for n, row in rows])
+        differences += [*np.moveaxis(np.abs(guide[grid, grid] - moved[:, grid]), -1, 0)]
     return float(np.quantile(np.maximum.reduce(differences), 0.75)) if differences else 0.0
 
 
@@ -751,30 +755,6 @@ def _guide_change(frame: PreparedFrame, neighbour: PreparedFrame, vectors: tuple
         difference = cv2.blur(guide - moved, (9, 9))
         shares.append(float(np.mean(np.square(difference).sum(axis=-1) > 3 * GUIDE_CHANGE**2)))
     return max(shares)
-
-
-def _warp_block(image: Array, flow: Array, block: tuple[slice, slice]) -> Array:
-    """Warp a block of an image along a flow of the whole frame; outside, the value of the border."""
-    rows, columns = (np.arange(size, dtype=np.float32)[part] for size, part in zip(flow.shape, block, strict=False))
-    moved = flow[block]
-    x, y = columns[None, :] + moved[..., 0], rows[:, None] + moved[..., 1]
-    if max(image.shape[:2]) > REMAPPED:
-        top, bottom = _needed(y, image.shape[0])
-        left, right = _needed(x, image.shape[1])
-        whole, image, x, y = image, image[top:bottom, left:right], x - np.float32(left), y - np.float32(top)
-        if max(image.shape[:2]) > REMAPPED:
-            return np.asarray(warp(whole, flow)[0][block], np.float32)
-    sampled = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(sampled, np.float32).reshape(*moved.shape[:2], image.shape[-1])
-
-
-def _needed(places: Array, size: int) -> tuple[int, int]:
-    """First and last row or column of an image that bilinear samples at these places read."""
-    finite = places[np.isfinite(places)]
-    if not finite.size:
-        return 0, 1
-    first, last = np.clip([np.floor(finite.min()), np.ceil(finite.max()) + 1], 0, size - 1)
-    return int(first), int(last) + 1
 
 
 def _noise_free_share(small: SmallFrame) -> float:
