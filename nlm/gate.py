@@ -13,9 +13,6 @@ from nlm.average import check_colors, check_exposure, check_window, mean_square
 _MEAN_SIZE = (9, 9)
 AROUND_SIZE = (15, 15)
 _DETAIL_SIZE = (5, 5)
-# Boxes of the difference from the centre and of the scatter of the neighbours; Gaussians of the same deviations, 3 and
-# 6 pixels, are alike. 1.5 and 2 pixels for the first cost up to 0.25 dB on shots without misaligned detail.
-_EXCESS_SIZE, _SCATTER_SIZE = (11, 11), (21, 21)
 # The mean of so few correlated errors is uncertain: a fifth above their expected square is still noise.
 _SURE = np.float32(1.2)
 # Frames of less confidence do not count: their squares vanish in float32, and their inverse is infinite.
@@ -123,9 +120,9 @@ def agreement_weight(estimates: Floats, noisy: Floats, confidence: Floats, expos
     Notes
     -----
     All in x / (x + exposure), squares in the mean over channels. With d_s the difference of a neighbour from the
-    centre, c its confidence, A = Σ c d / Σ c over the neighbours, N = B₂₁[Σ c] / B₂₁[Σ c² / Σ c], and B box means,
+    centre, c its confidence, A = Σ c d / Σ c over the neighbours, N = B₁₅[Σ c] / B₁₅[Σ c² / Σ c], and B box means,
 
-        V = B₂₁[Σ c (d − A)²] / B₂₁[Σ c − Σ c² / Σ c],    E = B₁₁[Σ c · A²] / B₁₁[Σ c],
+        V = B₁₅[Σ c (d − A)²] / B₁₅[Σ c − Σ c² / Σ c],    E = B₉[Σ c · A²] / B₉[Σ c],
 
     V is the variance of an estimate's error, and E should be V (1 + 1 / N). The part above that and the noise s² of the
     samples (B₁₅ of noisy − centre, squared), which the error of an estimate does not exceed, is the square of an error
@@ -142,8 +139,8 @@ def agreement_weight(estimates: Floats, noisy: Floats, confidence: Floats, expos
     noisy = np.ascontiguousarray(noisy, np.float32)
     run_bands(_compare_neighbours, len(noisy), estimates, noisy, confidence, np.float32(exposure), sums)
     spread, trust, repeat, excess, noise = sums
-    spread, wide, repeat = (cv2.blur(plane, _SCATTER_SIZE) for plane in (spread, trust, repeat))
-    excess, near = (cv2.blur(plane, _EXCESS_SIZE) for plane in (excess, trust))
+    spread, wide, repeat = (cv2.blur(plane, AROUND_SIZE) for plane in (spread, trust, repeat))
+    excess, near = (cv2.blur(plane, _MEAN_SIZE) for plane in (excess, trust))
     with np.errstate(divide="ignore", invalid="ignore"):  # where no neighbour is trusted
         count, variance = wide / repeat, np.maximum(spread, 0) / (wide - repeat)
         error = excess / near - cv2.blur(noise, AROUND_SIZE) - _SURE * variance * (1 + 1 / count)

@@ -124,9 +124,9 @@ def agreement_by_loops(estimates, noisy, confidence, exposure):
     repeat = ((c**2).sum(0) / total)[..., 0]
     total = total[..., 0]
     spread = (c * (d - mean) ** 2).sum(0).mean(-1)
-    variance = box(spread, 21) / (box(total, 21) - box(repeat, 21))
-    count = box(total, 21) / box(repeat, 21)
-    square = box(total * (mean**2).mean(-1), 11) / box(total, 11)
+    variance = box(spread, 15) / (box(total, 15) - box(repeat, 15))
+    count = box(total, 15) / box(repeat, 15)
+    square = box(total * (mean**2).mean(-1), 9) / box(total, 9)
     noise = box(((tone(noisy) - tone(estimates[middle])) ** 2).mean(-1), 15)
     error = np.maximum(square - noise - 1.2 * variance * (1 + 1 / count), 0)
     return variance / (variance + count * error)
