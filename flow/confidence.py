@@ -19,9 +19,6 @@ _NORMAL_LIMIT = np.float32(0.4)
 _NOISE_IN_VARIANCE = 1.4
 # Least variance of an outline: half floats and textures of a few shades have less.
 _LEAST_VARIANCE = np.float32(1e-4)
-# A difference counts up to this share of the variance when noise is measured, since where another surface is seen it is
-# no noise.
-_LARGEST_SHARE = np.float32(0.5)
 # Measured noise counts up to this: at 8 samples it is 0.05 to 0.15. With 0.15 a shot through a lens, whose guides hold
 # more, loses 0.2 dB at 32 samples.
 NOISE_LIMIT = 0.05
@@ -184,14 +181,14 @@ def outline_variance(variance: np.ndarray, distance: np.ndarray) -> np.ndarray:
 def measure_share(outlines: np.ndarray, distance: np.ndarray, inside: np.ndarray) -> tuple[float, float]:
     """Measure the noise of guides at outlines: squared differences of two frames over the variance, in [0, 0.05].
 
-    Σ min(|Δ|², V / 2) / Σ V over pixels inside (H, W), V their `outline_variance` where it is that of an outline; about
+    Σ min(|Δ|², V) / Σ V over pixels inside (H, W), V their `outline_variance` where it is that of an outline; about
     1 / N with N samples per pixel. 0 where there are few outlines.
     """
     shares = []
     for spread, difference in zip(np.moveaxis(outlines, -1, 0), np.moveaxis(distance, -1, 0), strict=True):
         known = inside & (spread > _LEAST_VARIANCE)
         spread, difference = spread[known], difference[known]
-        share = np.minimum(difference, _LARGEST_SHARE * spread).sum() / spread.sum() if len(spread) > _FEWEST else 0
+        share = np.minimum(difference, spread).sum() / spread.sum() if len(spread) > _FEWEST else 0
         shares.append(min(float(share), NOISE_LIMIT))
     return shares[0], shares[1]
 

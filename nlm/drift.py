@@ -6,13 +6,13 @@ from numba import njit
 
 from loops.parallel import Floats, run_bands
 from nlm.average import check_colors, check_exposure, check_window
+from nlm.samples import FAR
 from nlm.variance import gaussian_mean, ratio
 
 # Cells of 8×8 pixels, smoothed by σ = 2 of them: σ of 8, 16 and 32 pixels are as good to 0.05 dB.
-_CELL, _SIGMA = 8, 2.0
+CELL, SIGMA = 8, 2.0
 _DEVIATIONS = 1.5  # deviations of its own noise subtracted from the measured drift: 1 and 2 differ by 0.03 dB
 _ERROR = 0.1  # at least this share of two estimates' difference is their own error: no frame gets the weight 0
-_LIMIT = np.float32(12)  # a sample counts up to so many times the light: fireflies carry no evidence of drift
 
 
 def drift_weights(
@@ -53,19 +53,19 @@ def drift_weights(
     frames, height, width, _ = estimates.shape
     if frames < 5:
         return np.ones(confidence.shape, np.float32)
-    offset = first_row % _CELL
-    rows, columns = -(-(offset + height) // _CELL), -(-width // _CELL)
+    offset = first_row % CELL
+    rows, columns = -(-(offset + height) // CELL), -(-width // CELL)
     sums = np.zeros((5, rows, columns), np.float32)
     given = estimates, np.ascontiguousarray(noisy, np.float32), confidence, np.float32(exposure), offset
     run_bands(_hold_out, rows, *given, sums)
     worse, lags, squares, trusted, disagreement = sums
-    worse, lags, trusted, disagreement = (gaussian_mean(part, _SIGMA) for part in (worse, lags, trusted, disagreement))
+    worse, lags, trusted, disagreement = (gaussian_mean(part, SIGMA) for part in (worse, lags, trusted, disagreement))
     # The squares of a Gaussian's weights are those of one narrower by √2, over 4πσ².
-    noise = np.sqrt(gaussian_mean(squares, _SIGMA / np.sqrt(2)) / np.float32(4 * np.pi * _SIGMA**2))
+    noise = np.sqrt(gaussian_mean(squares, SIGMA / np.sqrt(2)) / np.float32(4 * np.pi * SIGMA**2))
     drift = ratio(np.maximum(worse - np.float32(_DEVIATIONS) * noise, 0), lags)
     differ = ratio(disagreement, trusted)
     error = np.maximum((differ - drift) / 2, np.float32(_ERROR) * differ)
-    off = cv2.resize(ratio(drift, error), (columns * _CELL, rows * _CELL), interpolation=cv2.INTER_LINEAR)
+    off = cv2.resize(ratio(drift, error), (columns * CELL, rows * CELL), interpolation=cv2.INTER_LINEAR)
     off = off[offset : offset + height, :width]
     weight = np.empty(confidence.shape, np.float32)
     for t, plane in enumerate(weight):
@@ -101,9 +101,9 @@ def _hold_out(
     T, H, W, _ = estimates.shape
     middle = T // 2
     for row in range(first, last):
-        for y in range(max(row * _CELL - offset, 0), min((row + 1) * _CELL - offset, H)):
+        for y in range(max(row * CELL - offset, 0), min((row + 1) * CELL - offset, H)):
             for x in range(W):
-                cell = x // _CELL
+                cell = x // CELL
                 light = np.float32(0)
                 for t in range(T):
                     if t != middle:
@@ -112,7 +112,7 @@ def _hold_out(
                 light = light / np.float32((T - 1) * 3) + exposure
                 # of x / (x + exposure), as (e/l)·(1/l): e² would vanish in dark scenes
                 slope = exposure / light / light
-                limit = _LIMIT * light
+                limit = FAR * light  # fireflies carry no evidence of drift
                 for side in (-1, 1):
                     near = middle + side
                     close, away = np.float32(0), np.float32(0)

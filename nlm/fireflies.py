@@ -37,7 +37,7 @@ STRANGER_WINDOW, STRANGERS = 17, 3
 # away the light spreads over other pixels.
 SAME_PHASE = 0.25
 # Places whose surroundings are looked at together: those of all at once would take gigabytes.
-_TOGETHER = 1024
+TOGETHER = 256
 
 
 @dataclass(frozen=True)
@@ -123,8 +123,8 @@ def without_strangers(lights: Highlights, color: Floats, pixels: Places, other: 
     At most 3 of 17×17 pixels are above a quarter of the brightest where the frame has none above an eighth beside.
     """
     counts = [np.zeros(0, np.intp)]
-    for first in range(0, len(pixels), _TOGETHER):
-        some = slice(first, first + _TOGETHER)
+    for first in range(0, len(pixels), TOGETHER):
+        some = slice(first, first + TOGETHER)
         # A pixel more on each side, for the brightest of 3×3 pixels.
         own, around = (_levels(color, lights.pixels[some], side) for side in (3, STRANGER_WINDOW + 2))
         near = np.maximum(np.maximum(around[:, :-2], around[:, 1:-1]), around[:, 2:])
@@ -142,8 +142,8 @@ def recurs_nearby(places: Places, color: Floats, pixels: Places, other: Floats) 
     """
     rows, columns, inside = (block[:, 0, 0] for block in _blocks(pixels, color.shape, 1))
     nearby = [np.zeros(0, np.float32)]
-    for first in range(0, len(places), _TOGETHER):
-        some = slice(first, first + _TOGETHER)
+    for first in range(0, len(places), TOGETHER):
+        some = slice(first, first + TOGETHER)
         around = _levels(other, np.stack([rows[some], columns[some]], axis=-1), SPREAD)
         nearby.append(around.max(axis=(1, 2)))
     near = np.concatenate(nearby)

@@ -17,6 +17,7 @@ from hybrid.alignment.transfer import ALBEDO_FLOOR, NO_LIGHT, compress, measure_
 from hybrid.files.frame import Array
 from loops.parallel import STRIP, Doubles, Mask, Places
 from nlm.average import channel_mean, reject_outliers
+from nlm.fireflies import TOGETHER
 from nlm.gate import color_gate
 from nlm.pixel_filter import measure_correlation
 from nlm.pooling import RESIDUAL_LIMIT
@@ -65,7 +66,6 @@ FEW = 32
 # Pixels on each side in which noise is looked for, and the share of lit ones without it that lies on a line with its
 # neighbours: of noise of 1 % a third does.
 AROUND, STRAIGHT = 16, 0.9
-TOGETHER = 256  # places that are looked at together: the pixels around all at once would take gigabytes
 # A tile that differs from its smoothed version by less than this, relative to exposure, has no noise.
 NOISE_FREE = 1e-4
 # Rows and columns of areas over the lit part: their medians average noise.

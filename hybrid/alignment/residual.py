@@ -10,13 +10,11 @@ from hybrid.alignment.transfer import ALBEDO_FLOOR
 from hybrid.files.frame import Array
 from loops.parallel import run_bands
 from nlm.cells import Axis, cell_axis
+from nlm.drift import CELL, SIGMA
 from nlm.pooling import RESIDUAL_LIMIT
 from nlm.variance import gaussian_mean
 
 _FLOOR = np.float32(ALBEDO_FLOOR)
-# Light that the limit of residuals takes is spread over a Gaussian of this deviation, pixels, in cells of so many: the
-# light of a few bright samples. Means over half or twice as many pixels give the same pictures within 0.1 dB.
-_SIGMA, _SIDE = 16.0, 8
 # Difference of two albedos over their sum from which on their quotient says nothing. With 0.4 one shot behind a lens
 # loses 0.3 dB at 512 samples, with 1 another gains 0.1 less at 8.
 _APART = np.float32(0.7)
@@ -73,10 +71,10 @@ def measure_limited(irradiance: Array, first_pass: Array, albedo: Array | None, 
     """
     absent = np.empty((0, 0, 0), np.float32)
     layers = [absent if layer is None else np.ascontiguousarray(layer) for layer in (irradiance, first_pass, albedo)]
-    rows, columns = (cell_axis(length, _SIDE) for length in irradiance.shape[:2])
-    sums = np.zeros((6, len(rows.pixels) // _SIDE, len(columns.pixels) // _SIDE), np.float32)
+    rows, columns = (cell_axis(length, CELL) for length in irradiance.shape[:2])
+    sums = np.zeros((6, len(rows.pixels) // CELL, len(columns.pixels) // CELL), np.float32)
     run_bands(_sum_limited, sums.shape[1], *layers, np.float32(exposure), rows, columns, sums)
-    kept, cut = np.split(np.stack([gaussian_mean(plane / np.float32(_SIDE**2), _SIGMA / _SIDE) for plane in sums]), 2)
+    kept, cut = np.split(np.stack([gaussian_mean(plane / np.float32(CELL**2), SIGMA) for plane in sums]), 2)
     lost = np.clip(-kept, np.minimum(cut, 0), np.maximum(cut, 0))
     return Limited(lost, rows, columns, np.float32(exposure)) if np.abs(lost).max() > _LOST else None
 

@@ -39,10 +39,11 @@ LARGE = 2**24  # pixels above which the frames of these pairs lie in temporary f
 EDGE_ROWS = 2 * SHORT_SIDE
 # A layer whose values lie within this of each other, relative to the largest, is constant: half floats round by 5e-4.
 SAME = 1e-3
-STRAY = 0.01  # share of pixels beyond its range that a layer may have: filters with negative lobes overshoot at edges
+# Share of pixels beyond its range that a layer may have, as filters with negative lobes overshoot at edges, or that an
+# estimate may have lost.
+STRAY = 0.01
 # The mean of a denoised picture may differ from that of the noisy one by this factor.
 LIGHT = 2.5
-LOST = 0.01  # share of its pixels that an estimate may have lost
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from hybrid.alignment.align import align
 from hybrid.alignment.fireflies import REACH
 from hybrid.alignment.measure import FIXED_NOISE_ABOVE
 from hybrid.alignment.transfer import BLACK, measure_gain
-from hybrid.checks.validation import LOST, find_lost_light, find_other_frame, find_sequence_grade
+from hybrid.checks.validation import STRAY, find_lost_light, find_other_frame, find_sequence_grade
 from hybrid.denoising.oidn import HOLDS, HOLDS_FAST, denoise_oidn, find_device, why_no_oidn
 from hybrid.denoising.pseudo_reference import FINAL, ClassicalPreset, filter_window
 from hybrid.denoising.stream import FirstPass, FrameStream
@@ -334,7 +334,7 @@ def _checked(picture: Array | None, frame: Frame, highlights: Highlights | None 
     filled, lost = replace_nonfinite(picture)
     noisy, bad = replace_nonfinite(frame.color)
     # Pixels that the renderer has lost as well do not count.
-    if (count := np.count_nonzero(lost & ~bad)) > LOST * lost.size:
+    if (count := np.count_nonzero(lost & ~bad)) > STRAY * lost.size:
         raise ValueError(f"{what}: {count} of {lost.size} pixels are not finite, where the frame is")
     filled = np.maximum(filled, 0)
     if highlights is not None:
