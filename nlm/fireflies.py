@@ -167,7 +167,9 @@ def average_highlights(lights: Highlights, others: Sequence[tuple[Highlights, Po
         alike = shown & _same_phase(moved)
         pattern[alike] += other.pattern[alike]
     pattern = _significant(pattern)
-    pattern /= pattern.sum(axis=(1, 2), keepdims=True)  # a light that was found has some
+    # A light that was found has some, but for a sample whose surroundings, without the pixel filter, are brighter.
+    total = pattern.sum(axis=(1, 2), keepdims=True)
+    pattern = np.divide(pattern, total, out=np.zeros_like(pattern), where=total != 0)
     mean = (light / count[:, None]).astype(np.float32)
     return Highlights(lights.pixels, lights.points, mean, pattern.astype(np.float32))
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from nlm.fireflies import (
+    Highlights,
     add_highlights,
     average_highlights,
     clamp_halos,
@@ -124,6 +125,13 @@ def test_the_mean_of_lights_leaves_out_patterns_of_another_place_in_the_pixel():
     mean = average_highlights(own, [(seen, moved, np.array([True]))])
     np.testing.assert_allclose(mean.light, [[7, 7, 7]], rtol=1e-4)
     np.testing.assert_allclose(mean.pattern[0, 1, 1], 1)
+
+
+def test_a_sample_below_its_surroundings_is_no_light():
+    """Beside a brighter light, where a pixel filter is undone."""
+    own = lights_of(calm([(10, 14, 6)]))
+    below = Highlights(own.pixels, own.points, -own.light, -own.pattern)
+    np.testing.assert_array_equal(add_highlights(calm(), average_highlights(below, [])), calm())
 
 
 def test_a_light_outside_the_frame_is_none():
