@@ -19,7 +19,7 @@ from loops.parallel import STRIP, Doubles, Mask, Places
 from nlm.average import channel_mean, reject_outliers
 from nlm.fireflies import TOGETHER
 from nlm.gate import color_gate
-from nlm.pixel_filter import measure_correlation
+from nlm.pixel_filter import measure_alone, measure_correlation
 from nlm.pooling import RESIDUAL_LIMIT
 from nlm.samples import BLACK
 from nlm.variance import second_differences
@@ -108,6 +108,8 @@ class FrameFacts:
     noise_free: float  # share of the tiles without noise, in [0, 1]
     samples: float | None  # samples per pixel, if known
     noise_correlation: Correlation | None = None  # of the noise; None if unknown
+    # where that was measured in the frame alone, its lower quartile over the picture at one pixel; else None
+    noise_correlation_alone: float | None = None
     alpha_grain: float = 0.0  # median noise, or texture, of alpha where all of 3×3 pixels are partly transparent
 
 
@@ -371,6 +373,35 @@ def noise_correlation(frame: PreparedFrame, neighbour: PreparedFrame) -> Correla
     if measured is None and compared.mean() > CUT:
         measured = np.zeros((2, 4))  # both show the same, without noise
     return None if measured is None else (tuple(measured[0].tolist()), tuple(measured[1].tolist()))
+
+
+def correlation_alone(frame: PreparedFrame) -> tuple[Correlation, float] | None:
+    """Correlation of the noise of one frame, and its lower quartile (`nlm.pixel_filter.measure_alone`), or None.
+
+    Texture correlates as noise under a filter does. The frame needs an albedo that differs between surfaces, and
+    normals, as a photograph behind the scene has none. Highlights on texture leave some of it in the quotient of color
+    and albedo: noise has to exceed the contrast of the albedo.
+    """
+    block = _middle(frame.irradiance.shape[:2])
+    if not frame.demodulated or frame.albedo is None or frame.normal is None:
+        return None
+    albedo = frame.albedo[block]
+    if np.ptp(albedo) < GUIDE_CHANGE:
+        return None
+    # Not by the floor of the irradiance, which leaves a part of the texture.
+    light = channel_mean(
+        np.asarray(remodulate(frame.irradiance[block], albedo) / np.maximum(albedo, BLACK), np.float32)
+    )
+    gray = channel_mean(albedo)
+    contrast = np.abs(gray - cv2.blur(gray, (3, 3))) / np.maximum(gray, BLACK)
+    texture = np.asarray(cv2.medianBlur(np.asarray(contrast, np.float32), 5), np.float32)  # without outlines
+    surface = (frame.normal[block] != 0).any(axis=-1)
+    level = np.abs(light)
+    measured = measure_alone(light, frame.valid[block] & surface, np.float32(NEAR) * level, texture * level)
+    if measured is None:
+        return None
+    (along_x, along_y), certain = measured
+    return (tuple(along_x.tolist()), tuple(along_y.tolist())), certain
 
 
 def _equal_share(a: Array, b: Array, compared: Mask, same: float) -> float:

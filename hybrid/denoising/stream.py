@@ -26,6 +26,7 @@ from hybrid.alignment.measure import (
     FrameFacts,
     PairFacts,
     SmallFrame,
+    correlation_alone,
     fixed_noise,
     inverse,
     least_outline_noise,
@@ -332,8 +333,8 @@ class FrameStream:
 
     def _without_filter(self, number: int) -> PreparedFrame:
         """A frame, in which the pixel filter of its noise is undone if the stage runs."""
-        frame, correlation = self._raw(number), self._correlation(number)
-        if correlation is None or not self.rules.whitens(correlation):
+        frame, (correlation, alone) = self._raw(number), self._correlation(number)
+        if correlation is None or not self.rules.whitens(correlation, alone):
             return frame
         with self.timings.stage("whiten"):
             return without_filter(frame, correlation)
@@ -341,15 +342,26 @@ class FrameStream:
     def _raw(self, number: int) -> PreparedFrame:
         return self._cached("raw", (number,), self._read)
 
-    def _correlation(self, number: int) -> Correlation | None:
-        """The correlation of a frame's noise by its difference to the frame before; without one, to the one after."""
+    def _correlation(self, number: int) -> tuple[Correlation | None, float | None]:
+        """The correlation of a frame's noise by its difference to the frame before; without one, to the one after.
+
+        Without both it is that of `correlation_alone`, with its lower quartile.
+        """
+        if "whiten" not in self.rules.allowed:
+            return None, None
         before, _, after = self.around(number, 1)
         for pair in ((before, number), (number, after)):
-            if "whiten" in self.rules.allowed and all(map(self.shot.has, pair)):
+            if all(map(self.shot.has, pair)):
                 found: Correlation | None = self._cached("correlation", pair, self._measure_correlation)
                 if found is not None:
-                    return found
-        return None
+                    return found, None
+        alone = self._cached("correlation alone", (number,), self._measure_alone)
+        return (None, None) if alone is None else alone
+
+    def _measure_alone(self, number: int) -> tuple[Correlation, float] | None:
+        frame = self._raw(number)
+        with self.timings.stage("plan"):
+            return correlation_alone(frame)
 
     def _measure_correlation(self, a: int, b: int) -> Correlation | None:
         try:
@@ -402,9 +414,10 @@ class FrameStream:
         frame = self._there(number)
 
         def measure(n: int) -> FrameFacts:
-            correlation = self._correlation(n)
+            correlation, alone = self._correlation(n)
             with self.timings.stage("plan"):
-                return replace(measure_frame(frame, self._small(n)), noise_correlation=correlation)
+                facts = measure_frame(frame, self._small(n))
+                return replace(facts, noise_correlation=correlation, noise_correlation_alone=alone)
 
         return self._cached("frame facts", (number,), measure)
 

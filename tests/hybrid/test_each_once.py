@@ -55,7 +55,14 @@ def count(monkeypatch):
     def watch(owner, name):
         monkeypatch.setattr(owner, name, counted(name, getattr(owner, name)))
 
-    measured = ("measure_frame", "measure_pair", "measure_flows", "fixed_noise", "noise_correlation")
+    measured = (
+        "measure_frame",
+        "measure_pair",
+        "measure_flows",
+        "fixed_noise",
+        "noise_correlation",
+        "correlation_alone",
+    )
     for name in ("prepare", "remove_fireflies", "shrink", *measured):
         watch(stream, name)
     for name in ("align", "align_results", "find_bright", "restore_mean", "blend_samples"):

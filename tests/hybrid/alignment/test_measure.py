@@ -11,6 +11,7 @@ from hybrid.alignment.measure import (
     FIXED_NOISE_ABOVE,
     REPEATED,
     UNEQUAL,
+    correlation_alone,
     equal_noise,
     fixed_noise,
     measure_frame,
@@ -171,3 +172,28 @@ def test_equal_frames_without_noise_have_a_correlation_of_0():
     color = np.random.default_rng(2).gamma(4, 0.1, (160, 240, 3)).astype(np.float32)
     frame = prepare(Frame(number=1, color=color, albedo=np.full_like(color, 0.5)))
     assert not np.any(noise_correlation(frame, frame))
+
+
+def test_texture_is_no_noise_of_a_frame_alone():
+    """A photograph that guides do not show has the correlation of a filter without having noise."""
+    rng = np.random.default_rng(2)
+    fine = cv2.GaussianBlur(rng.gamma(2, 1, (160, 240, 3)).astype(np.float32), (0, 0), 0.6)
+    albedo = np.where(np.arange(240)[:, None] < 120, np.float32(0.3), np.float32(0.6)) * np.ones_like(fine)
+    normal = np.zeros_like(fine)
+    normal[..., 2] = 1
+
+    def found(**guides):
+        return correlation_alone(prepare(Frame(number=1, color=fine, **guides)))
+
+    assert found(albedo=albedo, normal=normal)[1] > 0.2  # this is noise for all that the guides show
+    for guides in ({}, {"albedo": albedo}, {"normal": normal}):
+        assert found(**guides) is None
+    assert found(albedo=np.full_like(fine, 0.5), normal=normal) is None
+    assert found(albedo=albedo, normal=np.zeros_like(normal)) is None  # behind the scene
+    assert (
+        correlation_alone(prepare(Frame(number=1, color=fine, albedo=albedo, normal=normal), demodulated=False)) is None
+    )
+    painted = 0.1 + 0.8 * fine / fine.max()
+    for highlight in (0, 0.2):  # as bright on dark paint as on bright
+        shown = Frame(number=1, color=painted + np.float32(highlight), albedo=painted, normal=normal)
+        assert correlation_alone(prepare(shown)) is None

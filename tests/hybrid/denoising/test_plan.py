@@ -451,6 +451,27 @@ def test_a_pixel_filter_is_undone_where_noise_is_shared_both_ways_and_not_far(x,
     assert not Rules(off=frozenset({"whiten"})).whitens((x, y))
 
 
+WIDE = (0.6, 0.4, 0.2, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("lags", "least", "on", "words"),
+    [
+        ((0.4, 0.05, 0.01, 0.0), 0.3, True, "correlates by 0.30 in three quarters"),
+        ((0.4, 0.05, 0.01, 0.0), 0.15, False, "correlates by 0.15 in three quarters"),
+        (WIDE, 0.4, False, "may have no noise"),  # a picture that has been denoised
+    ],
+)
+def test_in_a_frame_alone_the_lower_quartile_decides(lags, least, on, words):
+    correlation = (lags, lags)
+    assert Rules().whitens(correlation, least) == on
+    facts = replace(FACTS, noise_correlation=correlation, noise_correlation_alone=least)
+    decision = next(d for d in Rules().decide([facts], []).decisions if d.stage == "whiten")
+    assert decision.on == on
+    assert words in decision.reason
+    assert (decision.figure is None) == (lags == WIDE)  # without a figure the log warns of nothing
+
+
 def test_a_frame_whose_noise_cannot_be_compared_stays_as_it_is():
     assert not Rules(on=frozenset({"whiten"})).whitens(None)
     decision = next(d for d in Rules().decide([FACTS], []).decisions if d.stage == "whiten")

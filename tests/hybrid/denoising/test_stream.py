@@ -300,6 +300,19 @@ def test_the_filter_of_the_first_frame_after_a_cut_is_measured_from_the_one_afte
     np.testing.assert_array_equal(stream.frame(1004).spread.inverse, stream.frame(1005).spread.inverse)
 
 
+def test_the_filter_of_a_frame_without_neighbours_is_measured_in_the_frame(tmp_path):
+    single = replace(GRAINY, frames=1)
+    plain = FrameStream(open_shot(single.write(tmp_path / "plain")), Rules())
+    stream = FrameStream(open_shot(single.write(tmp_path / "spread", edit=spread_layers)), Rules())
+    frame = stream.frame(1001)
+    assert plain.frame(1001).spread is None
+    assert frame.spread is not None
+    (facts,), _ = stream.measurements([1001])
+    assert facts.noise_correlation_alone > 0.17
+    before = np.abs(stream.shot.read(1001).color - plain.frame(1001).radiance).mean()
+    assert np.abs(frame.radiance - plain.frame(1001).radiance).mean() < 0.4 * before
+
+
 def test_texture_that_moves_is_no_noise(tmp_path):
     folder = GRAINY.write(tmp_path, without={"Vector", "Denoising Albedo", "Denoising Normal"})
     assert FrameStream(open_shot(folder), Rules(on=frozenset({"whiten"}))).frame(1003).spread is None
