@@ -16,7 +16,7 @@ from hybrid.alignment.prepare import PreparedFrame, rendered_flow, rough_light
 from hybrid.alignment.transfer import ALBEDO_FLOOR, NO_LIGHT, compress, measure_exposure, remodulate
 from hybrid.files.frame import Array
 from loops.parallel import STRIP, Doubles, Mask, Places
-from nlm.average import channel_mean, reject_outliers
+from nlm.average import channel_mean, reject_outliers, replace_nonfinite
 from nlm.fireflies import TOGETHER
 from nlm.gate import color_gate
 from nlm.pixel_filter import measure_alone, measure_correlation
@@ -59,6 +59,8 @@ LIGHT_AROUND = 8.0
 # Two frames have fixed noise where more than this share of it is the same at equal pixels: of thirty shots with a seed
 # for each frame at most 0.07, and 0.17 of frames of 40 rows; of three slow pans with one seed 0.29 to 0.68.
 FIXED_NOISE_ABOVE = 0.2
+# Least noise, relative to the light, that is compared by what denoised pictures lack: below, lost detail counts too.
+RESIDUAL_NOISE = np.float32(0.02)
 # A frame repeats another where at least this share is equal: all but burned-in text.
 REPEATED = 0.99
 # Fewer pixels show nothing of noise.
@@ -134,6 +136,8 @@ class PairFacts:
     repeated: bool = False  # whether the later frame repeats the earlier one, and has no samples of its own
     # factor of each channel from the earlier frame to the later, where they explain most of the change; else 1
     fade: Fade = NO_FADE
+    # share of the noise at equal pixels by denoised pictures in the files (`shared_residual`), in [0, 1]; 0 without
+    shared_noise: float = 0.0
     samples: float = 1.0  # samples of the later frame over those of the earlier one
 
 
@@ -324,6 +328,36 @@ def fixed_noise(frame: PreparedFrame, neighbour: PreparedFrame, *, moves: bool, 
     if unknown > sum(shares):
         return None
     return float(np.clip(np.average(figures, weights=shares), -1, 1)) if any(shares) else 0.0
+
+
+def relative_residual(color: Array, picture: Array) -> Array | None:
+    """The noise (h, w) in the middle of a frame by its denoised picture, relative to the light; None if it is little.
+
+    It is clipped at three times its median size: fireflies must not decide.
+    """
+    block = _middle(color.shape[:2])
+    noisy, denoised = (channel_mean(replace_nonfinite(image[block])[0]) for image in (color, picture))
+    noise = (noisy - denoised) / (np.abs(denoised) + 0.01 * measure_exposure(denoised[..., None]))
+    size = np.float32(np.median(np.abs(noise)))
+    return np.clip(noise, -3 * size, 3 * size) if size > RESIDUAL_NOISE else None
+
+
+def shared_residual(first: Array | None, second: Array | None) -> float:
+    """Share of the noise of two frames that is the same at equal pixels, by their `relative_residual`; 0 if unknown.
+
+    It is their correlation there less that with neighbouring pixels, as detail that a denoiser has lost has both. On
+    ten shots of 8 to 512 samples it is at most 0.07 with a seed for each frame, on six slow pans with one seed 0.4
+    to 0.7.
+    """
+    if first is None or second is None or min(first.shape) < 2:
+        return 0.0
+    beside = (
+        (first[:, 1:], second[:, :-1]),
+        (first[:, :-1], second[:, 1:]),
+        (first[1:], second[:-1]),
+        (first[:-1], second[1:]),
+    )
+    return max(correlation(first, second) - max(0.0, *(correlation(*pair) for pair in beside)), 0.0)
 
 
 def _at_ends(image: Array, flow: Array) -> tuple[Array, Mask]:

@@ -232,7 +232,7 @@ def measure_stages(frames: Sequence[FrameFacts], pairs: Sequence[PairFacts]) -> 
         _decide_clean_guides(prefilter, least_outline_noise(pairs), [frame.samples for frame in frames]),
         _switch("stabilize", bool(pairs), neighbours),
         _switch("restore-mean", clean < 1, f"{1 - clean:.1%} of the tiles hold noise"),
-        _switch("blend-samples", True, "each pixel is compared with its samples"),
+        _decide_blend_samples([pair.shared_noise for pair in pairs]),
         _switch("alpha", bool(transparent), alpha),
         _decide("clean-alpha", max(frame.alpha_grain for frame in frames), ALPHA_NOISE_ABOVE, grain),
         _switch("skip", clean > 0, f"{clean:.1%} of the tiles hold no noise"),
@@ -328,6 +328,12 @@ def _decide_fixed_noise(figures: Sequence[float]) -> Decision:
         reason += ": the render has one seed for all frames: samples of neighbours add nothing; in Blender, "
         reason += "switch on Render > Sampling > Advanced > Animate Seed (the clock beside Seed)"
     return _decide("fixed-noise", figure, FIXED_NOISE_ABOVE, reason)
+
+
+def _decide_blend_samples(shares: Sequence[float]) -> Decision:
+    if (share := float(np.median(shares or 0.0))) > FIXED_NOISE_ABOVE:
+        return _switch("blend-samples", False, f"neighbouring frames share {share:.2f} of their noise")
+    return _switch("blend-samples", True, "each pixel is compared with its samples")
 
 
 def _decide_prefilter(grain: Sequence[float], noise: Iterable[float], unknown: bool) -> Decision:

@@ -33,8 +33,10 @@ from hybrid.alignment.measure import (
     measure_frame,
     measure_pair,
     noise_correlation,
+    relative_residual,
     relit,
     scaled,
+    shared_residual,
     shrink,
 )
 from hybrid.alignment.prepare import PreparedFrame, prepare, prepared_planes, without_filter
@@ -113,7 +115,7 @@ class FrameStream:
         def is_kept(kind: str, frames: tuple[int, ...]) -> bool:
             if kind == "raw":  # the noise of a frame is compared with that of the next one, and then no more
                 return max(loaded, default=first) <= frames[0] <= last
-            beyond = kind in ("read", "rendered", "correlation", "same noise")
+            beyond = kind in ("read", "rendered", "residual", "correlation", "same noise")
             return first <= frames[0] <= last if beyond else kept.issuperset(frames)
 
         self._cache = {key: value for key, value in self._cache.items() if is_kept(*key)}
@@ -322,8 +324,8 @@ class FrameStream:
             return number + distance * self.shot.step
 
         def repeats_noise(distance: int) -> bool:
-            nearer = distance - 1 if distance > 0 else distance + 1
-            return self.same_noise(*sorted((other(nearer), other(distance)))) > FIXED_NOISE_ABOVE
+            pair = sorted((other(distance - 1 if distance > 0 else distance + 1), other(distance)))
+            return max(self.same_noise(*pair), self._shared_residual(*pair)) > FIXED_NOISE_ABOVE
 
         return remove_fireflies(rendered, lambda k: self.rendered(other(k)), repeats_noise, self.timings)
 
@@ -390,6 +392,14 @@ class FrameStream:
 
         return self._cached("same noise", (a, b), search)
 
+    def _shared_residual(self, a: int, b: int) -> float:
+        """The share of the noise of two neighbouring frames that is the same, by the pictures in their files, or 0."""
+        for number in (a, b):
+            if ("residual", (number,)) not in self._cache:
+                self._read(number)
+        first, second = (cast(Array | None, self._cache["residual", (number,)]) for number in (a, b))
+        return shared_residual(first, second)
+
     def _read(self, number: int) -> PreparedFrame:
         with self.timings.stage("read"):
             frame = self.shot.read(number)
@@ -401,6 +411,8 @@ class FrameStream:
                 inside = np.zeros_like(prepared.valid)
                 inside[region] = prepared.valid[region]
                 prepared = replace(prepared, unfiltered=replace(prepared.unfiltered, region=region), valid=inside)
+            residual = None if frame.estimate is None else relative_residual(frame.color, frame.estimate)
+            self._cache["residual", (number,)] = residual
         # A first pass reads no more of it.
         kept = ("number", "color", "albedo", "normal", "estimate", "source")
         read = Frame(**{name: getattr(frame, name) for name in kept})
@@ -427,7 +439,8 @@ class FrameStream:
         def measure(*_: int) -> PairFacts:
             with self.timings.stage("plan"):
                 facts = measure_pair(first, second, (self._small(a), self._small(b)))
-            return facts if facts.fixed_noise is not None else replace(facts, fixed_noise=self.same_noise(a, b))
+            fixed = self.same_noise(a, b) if facts.fixed_noise is None else facts.fixed_noise
+            return replace(facts, fixed_noise=fixed, shared_noise=self._shared_residual(a, b))
 
         return self._cached("pair facts", (a, b), measure)
 

@@ -6,10 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
+from hybrid.alignment.measure import fixed_noise
 from hybrid.denoising.first_pass import PerFrame, find_first_pass
-from hybrid.denoising.plan import Rules
+from hybrid.denoising.plan import DENOISED, Rules
 from hybrid.denoising.stream import FrameStream, plan_shot
 from hybrid.files.shots import open_shot
+from tests.exr_files import write_layers
 from tests.scenes import Scene, grained
 
 # Locked off. Frame numbers 1001 to 1012.
@@ -338,3 +340,53 @@ def test_frames_that_repeat_are_found_where_their_filter_is_undone(tmp_path):
     plan = plan_shot(open_shot(still.write(tmp_path, edit=repeat)))
     assert "whiten" in plan.stages
     assert plan.repeats == ((1003, 1004),)
+
+
+SPARKS = [(20, 30), (40, 90), (60, 50), (70, 110)]
+
+
+def write_slow_pan(folder, *, one_seed, denoised=False, sparks=False):
+    """Five frames of a wall that moves by 0.4 pixels a frame; with one seed two thirds of the noise stay at a pixel."""
+    y, x = np.mgrid[:96, :128].astype(np.float32)
+    for index in range(5):
+        at = x - np.float32(0.4 * index)
+        wall = (0.5 + 0.05 * np.sin(1.7 * at) + 0.05 * np.sin(2.3 * y + 0.3 * at))[..., None].repeat(3, axis=-1)
+        shared, own = (np.random.default_rng(seed).normal(size=(96, 128, 1)) for seed in (5, 6 + index))
+        grain = np.exp(0.4 * (np.sqrt(0.67) * (shared if one_seed else own) + np.sqrt(0.33) * own[::-1]))
+        noisy = (wall * grain).astype(np.float32)
+        for spark in SPARKS if sparks else ():
+            noisy[spark] = 50  # as clamped samples, all of one light
+        pictures = {"Combined": wall, "Noisy Image": noisy} if denoised else {"Combined": noisy}
+        layers = {f"ViewLayer.{name}": picture for name, picture in pictures.items()}
+        layers["ViewLayer.Vector"] = np.full((96, 128, 4), (-0.4, 0, -0.4, 0), np.float32)
+        write_layers(folder / f"pan.{1001 + index}.exr", layers)
+    return open_shot(folder / "pan.####.exr")
+
+
+@pytest.mark.parametrize("one_seed", [True, False])
+def test_noise_of_one_seed_is_found_in_pans_slower_than_half_a_pixel(tmp_path, one_seed):
+    """The noise passed for detail there, which lost up to 4 dB of frames that Blender had denoised."""
+    stream = FrameStream(write_slow_pan(tmp_path, one_seed=one_seed), Rules())
+    first, second = stream.rendered(1002), stream.rendered(1003)
+    assert fixed_noise(first, second, moves=False) is None
+    share = stream.same_noise(1002, 1003)
+    assert share > 0.4 if one_seed else share < 0.1
+    plan = stream.plan(stream.around(1003), DENOISED)
+    assert ("fixed-noise" in plan.stages) == one_seed
+
+
+@pytest.mark.parametrize("one_seed", [True, False])
+def test_samples_that_share_noise_do_not_judge_a_picture(tmp_path, one_seed):
+    stream = FrameStream(write_slow_pan(tmp_path, one_seed=one_seed, denoised=True), Rules())
+    _, pair = stream.measurements([1001, 1002, 1003])[1]
+    assert pair.shared_noise == pytest.approx(0.67 if one_seed else 0, abs=0.1)
+    plan = stream.plan(stream.around(1003), DENOISED)
+    assert ("blend-samples" in plan.stages) != one_seed
+
+
+def test_sparks_that_stay_at_their_pixels_are_no_lamps(tmp_path):
+    """Clamped samples are equally bright: along a slow pan frames of one seed bore witness to each other."""
+    stream = FrameStream(write_slow_pan(tmp_path, one_seed=True, sparks=True), Rules())
+    frame = stream.frame(1003)
+    assert frame.highlights is None
+    assert frame.fireflies == len(SPARKS)
