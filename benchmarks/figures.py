@@ -1,14 +1,14 @@
 """Make every table, chart and animation of README.md and docs/results.md from one revision.
 
-    python benchmarks/figures.py WORK [--parts ladder second filters times] [--scenes FOLDER] [--python FILE]
+    python benchmarks/figures.py WORK [--parts ladder second blender filters times] [--scenes FOLDER] [--python FILE]
     python benchmarks/figures.py WORK --write
 
-WORK/shots holds the shots of `LADDER`, one folder each; those that are not there are rendered by `ravg simulate`, the
-real scenes from the .blend files in FOLDER, with Blender's Python module in the interpreter FILE. Figures go to
-WORK/figures.json as they are measured, so that a run may be stopped and continued; those of another revision of the
-code are dropped. `--write` copies them to docs/figures.json, writes the blocks of the pages between
-``<!-- figures: NAME -->`` and ``<!-- end -->``, and draws the pictures. `tests/test_figures.py` compares the pages with
-the file.
+WORK/shots holds the shots of `LADDER` and others, one folder each; those that are not there are rendered, the real
+scenes from the .blend files in FOLDER, with Blender's Python module in the interpreter FILE. Figures go to
+WORK/figures.json as they are measured, so that a run may be stopped and continued. Parts of another revision of the
+code are measured anew; those that are not named keep the published figures, with their own revision. `--write` copies
+the file to docs/figures.json, writes the blocks of the pages between ``<!-- figures: NAME -->`` and ``<!-- end -->``,
+and draws the pictures. `tests/test_figures.py` compares the pages with the file.
 """
 
 import argparse
@@ -148,17 +148,18 @@ def provenance() -> Results:
 
 
 class Record:
-    """Figures by part and key, written to a file after each of them."""
+    """Figures by part and key, written to a file after each of them; parts that are not measured stay as published."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, parts: Iterable[str]) -> None:
         self._path = path
-        self.values: Results = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-        if self.values.get("about", {}).get("state") != state():
-            self.values = {"about": provenance()}
+        self.values: Results = json.loads((path if path.exists() else FIGURES).read_text(encoding="utf-8"))
+        for part in parts:
+            if self.values["about"].get(part, {}).get("state") != state():
+                self.values[part], self.values["about"][part] = {}, provenance()
 
     def add(self, part: str, key: str, figures: Callable[[], list[float]]) -> None:
         """Measure the figures of a key, unless they are there."""
-        if key not in self.values.setdefault(part, {}):
+        if key not in self.values[part]:
             self.values[part][key] = figures()
             self._path.write_text(json.dumps(self.values, indent=0), encoding="utf-8")
             print(part, key, *self.values[part][key], flush=True)
@@ -369,15 +370,13 @@ def _blender_gains(results: Results, level: str, method: str) -> dict[str, list[
 def blender(results: Results) -> str:
     """Results: presets that start from Blender's own frames."""
     names = NAMES | {"given": "Blender's"}
-    shown = ("noisy", "given", *RIVALS)
+    shown = list(product(BLENDER_LEVELS, ("given", "balanced", "quality")))
+    head = (f"{names[method]}, {BLENDER_LEVELS[level]}" for level, method in shown)
     rows = [
-        [
-            f"*{name.removeprefix('blender-')}*, {BLENDER_LEVELS[level]} samples",
-            *(_pair(results["blender"][f"{name} {level} {method}"][:2]) for method in shown),
-        ]
-        for name, level in product(BLENDER, BLENDER_LEVELS)
+        [f"*{name.removeprefix('blender-')}*", *(_pair(results["blender"][f"{name} {lv} {m}"][:2]) for lv, m in shown)]
+        for name in BLENDER
     ]
-    return _rows(("shot", *(names[method] for method in shown)), rows)
+    return _rows(("shot", *head), rows)
 
 
 def default_settings(results: Results) -> str:
@@ -411,15 +410,16 @@ def times(results: Results) -> str:
     return _rows(("method", "CPU time a frame", "peak memory", "of OIDN high", "of OIDN best"), rows)
 
 
-BLOCKS = {
-    "summary": summary,
-    "samples": samples,
-    "shots": shots,
-    "second": second,
-    "blender": blender,
-    "default_settings": default_settings,
-    "filters": filters,
-    "times": times,
+# Tables, and the parts that their figures are of.
+BLOCKS: dict[str, tuple[Callable[[Results], str], tuple[str, ...]]] = {
+    "summary": (summary, ("ladder", "times")),
+    "samples": (samples, ("ladder",)),
+    "shots": (shots, ("ladder",)),
+    "second": (second, ("second",)),
+    "blender": (blender, ("blender",)),
+    "default_settings": (default_settings, ("blender",)),
+    "filters": (filters, ("filters",)),
+    "times": (times, ("times",)),
 }
 
 
@@ -435,8 +435,9 @@ def fill(text: str, results: Results) -> str:
     """A page with its blocks written anew."""
 
     def block(match: re.Match[str]) -> str:
-        table = BLOCKS[match["name"]](results)
-        return f"<!-- figures: {match['name']} -->\n{table}\n\n{origin(results['about'])}\n<!-- end -->"
+        make, parts = BLOCKS[match["name"]]
+        origins = "\n".join(dict.fromkeys(origin(results["about"][part]) for part in parts))
+        return f"<!-- figures: {match['name']} -->\n{make(results)}\n\n{origins}\n<!-- end -->"
 
     return re.sub(r"<!-- figures: (?P<name>\w+) -->\n.*?<!-- end -->", block, text, flags=re.DOTALL)
 
@@ -531,7 +532,7 @@ def main() -> int:
     parser.add_argument("--write", action="store_true", help="write pages and pictures")
     options = parser.parse_args()
     options.work.mkdir(parents=True, exist_ok=True)
-    record = Record(options.work / "figures.json")
+    record = Record(options.work / "figures.json", options.parts)
     for part in options.parts:
         PARTS[part](record, options)
     if options.write:

@@ -38,4 +38,5 @@ def test_pictures_are_those_that_were_drawn_from_the_same_figures():
 
 
 def test_figures_are_of_this_version():
-    assert RESULTS["about"]["version"] == figures.version("ravg")
+    assert RESULTS["about"].keys() == figures.PARTS.keys()
+    assert {about["version"] for about in RESULTS["about"].values()} == {figures.version("ravg")}

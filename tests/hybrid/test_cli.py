@@ -220,7 +220,7 @@ def test_what_is_not_run_is_said(shot_folder, tmp_path, capsys):
 
 
 def test_a_run_is_ten_lines(tmp_path, capsys):
-    shot = Path(__file__).parents[2] / "examples" / "shot" / "noisy.####.exr"
+    shot = Path(__file__).parents[1] / "data" / "bathroom" / "noisy.####.exr"
     _, _, err = run(capsys, "denoise", shot, "-o", tmp_path / "o", "--preset", "draft", "--frames", "8-10")
     lines = [line for line in err.splitlines() if " of 3 frames, " not in line and "compiling" not in line]
     labels = ["Input", "Settings", "Passes", "First", "Output", "Total", "Next", "Details"]

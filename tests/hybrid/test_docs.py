@@ -91,7 +91,7 @@ def test_looking_at_a_shot(capsys):
         assert re.fullmatch(shown, here)
         assert process.stdout.readline().strip() == end
         with urllib.request.urlopen(here + "state", timeout=30) as state:
-            assert state.read().count(b'"14"') >= 2  # of the frames that are finished, and of those beside them
+            assert state.read().count(b'"13"') >= 2  # of the frames that are finished, and of those beside them
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=30) == 0
     finally:
@@ -231,4 +231,4 @@ def test_python_of_the_documentation_runs(index, capsys):
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(encoding="utf-8"), re.DOTALL)
     assert len(blocks) == 2
     exec(compile(blocks[index], "python.md", "exec"), {})
-    assert ["10 out/denoised.0010.exr", "2 (180, 320, 3)"][index] in capsys.readouterr().out
+    assert ["10 out/denoised.0010.exr", "2 (270, 480, 3)"][index] in capsys.readouterr().out
