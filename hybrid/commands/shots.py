@@ -180,7 +180,8 @@ def log_noise(plan: Plan) -> list[str]:
     for decision in plan.decisions:
         if decision.forced or decision.figure is None or decision.threshold is None:
             continue
-        if decision.stage == "fixed-noise" and decision.on:
+        shared = decision.stage == "blend-samples" and not decision.on
+        if (decision.stage == "fixed-noise" and decision.on) or (shared and "seed" not in found):
             found.append("seed")
             LOG.warning(f"constant seed: {decision.reason}")
         elif decision.stage == "whiten" and not decision.on and decision.figure > decision.threshold:

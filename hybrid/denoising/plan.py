@@ -76,6 +76,11 @@ class Context(NamedTuple):
     reads_guides: bool = True  # whether the denoiser, or the filter of AOVs, reads guides or samples beside them
 
 
+ONE_SEED = (
+    "the render has one seed for all frames: samples of neighbours add little; in Blender, switch on "
+    "Render > Sampling > Advanced > Animate Seed (the clock beside Seed)"
+)
+
 #: A window of noisy frames alone, and one with a first pass.
 NOISY, DENOISED = Context(first_pass=False), Context(first_pass=True)
 
@@ -325,14 +330,14 @@ def _decide_fixed_noise(figures: Sequence[float]) -> Decision:
     figure = float(np.median(figures))
     reason = "{:.2f} of the noise of neighbouring frames is the same at equal pixels"
     if figure > FIXED_NOISE_ABOVE:
-        reason += ": the render has one seed for all frames: samples of neighbours add nothing; in Blender, "
-        reason += "switch on Render > Sampling > Advanced > Animate Seed (the clock beside Seed)"
+        reason += f": {ONE_SEED}"
     return _decide("fixed-noise", figure, FIXED_NOISE_ABOVE, reason)
 
 
 def _decide_blend_samples(shares: Sequence[float]) -> Decision:
     if (share := float(np.median(shares or 0.0))) > FIXED_NOISE_ABOVE:
-        return _switch("blend-samples", False, f"neighbouring frames share {share:.2f} of their noise")
+        reason = f"neighbouring frames share {share:.2f} of their noise by their denoised pictures: {ONE_SEED}"
+        return Decision("blend-samples", False, share, FIXED_NOISE_ABOVE, reason)
     return _switch("blend-samples", True, "each pixel is compared with its samples")
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from hybrid.alignment.measure import fixed_noise
+from hybrid.commands.shots import log_noise
 from hybrid.denoising.first_pass import PerFrame, find_first_pass
 from hybrid.denoising.plan import DENOISED, Rules
 from hybrid.denoising.stream import FrameStream, plan_shot
@@ -382,6 +383,9 @@ def test_samples_that_share_noise_do_not_judge_a_picture(tmp_path, one_seed):
     assert pair.shared_noise == pytest.approx(0.67 if one_seed else 0, abs=0.1)
     plan = stream.plan(stream.around(1003), DENOISED)
     assert ("blend-samples" in plan.stages) != one_seed
+    assert log_noise(plan) == ["seed"] * one_seed
+    alone = [decision for decision in plan.decisions if decision.stage != "fixed-noise"]
+    assert log_noise(replace(plan, decisions=tuple(alone))) == ["seed"] * one_seed
 
 
 def test_sparks_that_stay_at_their_pixels_are_no_lamps(tmp_path):
