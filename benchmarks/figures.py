@@ -179,9 +179,9 @@ def find_scene(scene: str, options: argparse.Namespace) -> str:
 
 
 def find_shot(name: str, options: argparse.Namespace) -> Path:
-    """The folder of a shot, rendered if it is not there."""
+    """The folder of a shot: seven frames of each level, and references of three; rendered unless all are there."""
     folder: Path = options.work / "shots" / name
-    if any(folder.glob("reference_b.*.exr")) and any(folder.glob("s*.0007.exr")):
+    if len(list(folder.glob("reference_b.*.exr"))) >= 3 and len(list(folder.glob("s*.exr"))) % 7 == 0:
         return folder
     if name in OTHERS:
         _, renderer, *words = OTHERS[name]

@@ -62,13 +62,13 @@ def estimate_confidence(
     inside : (H, W) bool array, from `find_coverage`
     reverse : (H, W, 2) float array, optional, pixels, neighbour to centre
     albedo, other_albedo : (H, W, C) float array, optional
-        Of the centre and the neighbour, both or none; likewise the normals.
+        Guides of the centre and the neighbour, both or none; likewise the normals.
     normal, other_normal : (H, W, 3) float array, optional, in any one space, of any length, 0 where there is no surface
     first_row : int
         The frame's row that the first row of `flow` belongs to, where the arrays of the centre are some of its rows;
         those of the neighbour are always of the whole frame.
     noise : GuideNoise, optional
-        Of the centre's guides; None: they have none.
+        Noise of the centre's guides; None: no noise.
 
     Returns
     -------

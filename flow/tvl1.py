@@ -15,7 +15,7 @@ from loops.parallel import run_bands
 # Coupling of the data and the smoothness half of the energy (Zach's theta), and step of the dual ascent;
 # tau / theta = 0.25 / 0.3 is below the bound for convergence.
 _THETA = np.float32(0.3)
-_DUAL_STEP = np.float32(0.25 / 0.3)
+_DUAL_STEP = np.float32(0.25) / _THETA
 # λ of each guide, for guides in [0, 1]: 255 times that of 8-bit images (0.03 to 0.06 there). Higher follows the guides
 # more closely, as a flow from guides alone needs.
 _REFINE_ATTACHMENT, _DENSE_ATTACHMENT = 8.0, 16.0

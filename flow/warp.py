@@ -241,7 +241,8 @@ def warp(
     Returns
     -------
     warped : float32 array
-        Of the shape of `image`, less the rows without flow: `image[y + v, x + u]`; outside the frame the edge value.
+        The warped image, in the shape of `image` less the rows without flow: `image[y + v, x + u]`; outside the frame
+        the edge value.
     inside : (H, W) or (h, W) bool array
         x + u in [-0.5, W - 0.5], and y + v alike. False where the flow is not finite.
 

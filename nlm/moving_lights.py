@@ -76,9 +76,9 @@ def passing_lights(
     """Find the bright pixels (H, W) that the frames before and after show along one steady motion, rows and columns.
 
     `excess` and `bright` are as for `confirmed_by_neighbour`, `others` maps −1 (the frame before) and 1, or one of
-    these, to both there and the `flow` to it. For an excess that edges of moving things have too: motions must be few,
-    as those between two edges are not, and opposite in both frames, unless the pixel leaves the frame: noise is seldom
-    confirmed twice. The motion is that to the frame after that most pixels share.
+    these, to both there and the `flow` to it. Edges of moving objects are bright in the excess too. So there must be
+    few shared motions, as edges share many, and a motion must be opposite in both frames, unless the pixel leaves the
+    frame. Noise is seldom confirmed twice. The motion is that to the frame after that most pixels share.
     """
     motions = {
         time: [(time * y, time * x) for y, x in shared_motions(bright, other_bright)]

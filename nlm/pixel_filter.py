@@ -19,8 +19,8 @@ _MEAN = 4.0
 # Side, pixels, of the tiles whose median is the measure, and the least number of them. In many tiles of a clean frame
 # vectors do not explain the picture, which then differs as correlated noise does.
 _TILE, _LEAST_TILES = 16, 8
-# Rows, or columns, of light alone from which noise is told by their fourth difference, which takes smooth light, and
-# edges along x and along y, away: by second differences light at 512 samples adds 0.06 more to the measure.
+# Fourth difference along rows or columns, which separates the noise of a single frame from its light: it removes smooth
+# light, and edges along x and y. With second differences, light at 512 samples adds 0.06 more to the measure.
 _FOURTH = (1, -4, 6, -4, 1)
 # Pixels beyond the end of a filter of five pixels, at which differences are those of noise that is not shared.
 _APART = (5, 6)

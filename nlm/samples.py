@@ -67,13 +67,13 @@ _LAMP = 4.0
 _GLARE = 64.0
 # Least weight of a frame with the centre's geometry and other light.
 _OTHER_LIGHT = 0.02
-# The second least squared distance of a sample from N others, over its variance, is 1 / (0.33 N − 0.28) for Gaussian
-# noise that all channels share, and more for other noise. The least one takes a bright sample that a single one of six
-# frames shows as well for light without noise: a sparkle, 0.13 dB of a shot.
+# The variance of a sample is estimated as its second least squared distance from N others, times 0.33 N − 0.28: exact
+# for Gaussian noise that all channels share, too large for other noise. By the least distance, a bright sample that one
+# of six frames repeats by chance counts as light without noise: a sparkle, 0.13 dB of a shot.
 _SECOND, _FEW = 0.33, 0.28
-# Deviation, pixels, of the Gaussian over which the light of neighbours is compared with the centre's for the variance,
-# and the share of the noise that this leaves: one of 20 pixels' worth is taken for light. Over 4 pixels light that
-# changes by 2 % a frame passes for 3 % of noise at a rim that one neighbour shows.
+# Deviation, pixels, of the Gaussian over which the ratio of the centre's light to the neighbours' is fitted for the
+# variance. The fit over 20 pixels removes a twentieth of the noise; `_LEFT` is the share that remains. Over 4 pixels
+# light that changes by 2 % a frame passes for 3 % of noise at a rim that one neighbour shows.
 _LIGHT = 1.25
 _LEFT = np.float32(1 - 1 / (4 * np.pi * _LIGHT**2))
 # Greatest factor between the light of neighbours and the centre's: where half of a picture fades by 0.6 a frame it is
@@ -81,7 +81,7 @@ _LEFT = np.float32(1 - 1 / (4 * np.pi * _LIGHT**2))
 # 2.5 a place of a wall without any became 70 % too bright, and with 4 a shot at 8 samples loses 0.05 dB.
 _RELIT = np.float32(2.25)
 # Albedo below that of any surface, by which light is divided in place of black.
-BLACK = np.float32(1e-3)
+LEAST_ALBEDO = np.float32(1e-3)
 # Cells per deviation of a mean.
 _CELLS = 4
 _WARPED = np.float32(WARPED)
@@ -220,8 +220,9 @@ def blend_samples(
 def _light_around(picture: Floats, noisy: Floats, others: Floats, exposure: float) -> Floats:
     """Mean light of a picture (H, W) over σ = 2 pixels, and of lamps beyond 64 exposures their own.
 
-    A lamp excuses no error of the pixels beside it, of which a picture may make lamps: no lamp exceeds the samples, of
-    the frame or of others. By the frame's alone, weights are greatest where its noise is dark: a lamp lost 17 %.
+    Errors beside a lamp are not divided by the lamp's light. A denoiser may turn such pixels into lamps, so no lamp
+    counts as brighter than the samples of the frame or of others. With the frame's samples alone, weights were greatest
+    where their noise was dark, and a lamp lost 17 %.
     """
     level, bright = channel_mean(picture), np.float32(_GLARE * exposure)
     samples = np.maximum(channel_mean(noisy), channel_mean(others))
@@ -282,10 +283,10 @@ def _energy_of(noisy: Floats, rate: Floats, picture: Floats | None, albedo: Floa
         outer = slice(max(top - 1, 0), bottom + 1)
         strip = noisy[outer] if picture is None else noisy[outer] - picture[outer]
         if albedo is not None:
-            strip = strip / np.maximum(albedo[outer], BLACK)
+            strip = strip / np.maximum(albedo[outer], LEAST_ALBEDO)
         found = second_differences(np.ascontiguousarray(strip))[top - outer.start :]
         if albedo is not None:
-            found = found[: bottom - top] * np.maximum(albedo[rows], BLACK)
+            found = found[: bottom - top] * np.maximum(albedo[rows], LEAST_ALBEDO)
         found = found[: bottom - top] * rate[rows, :, None]
         energy[rows] = np.einsum("yxc,yxc->yx", found, found) / np.float32(36)  # the squares of the coefficients
     return energy
@@ -330,7 +331,8 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
 
         s = max(0, 1 − k (1 + (f / N)²) v / D²),    v = K[d²] / n,    N = n K[d²]² / K[d⁴],
 
-    D is K d, without what the light cut off by the limit explains: a mean without the brightest samples is too dark.
+    D is K d, moved towards 0 by up to the mean light that the limit cut off: without its brightest samples a mean is
+    too dark.
     All in the mean over channels, n the pixels of K: the shrinkage of James and Stein. N counts the samples that make
     the noise: five fireflies determine neither a mean nor its variance. The weight u keeps the light of all pixels
     but those much brighter than their surroundings, which count by their relative error: a lamp that is too bright

@@ -23,8 +23,6 @@ _NOISELESS = np.float32(1e-6)
 _LEAST = np.float32(1e-8)
 # Beyond this share of the columns a window is filtered as a whole.
 _MOST_COLUMNS = 0.75
-# Radius, pixels, of the boxes that smooth variances.
-_RADIUS = 2
 
 
 def variance_from_halves(a: Floats, b: Floats) -> Floats:
@@ -106,7 +104,7 @@ def smooth_variance(variance: Floats) -> Floats:
     median *= np.float32(_CAP)
     cut = np.minimum(variance, median, out=median)
     # Running sums beside values of 1e24 round to below 0.
-    smooth = np.asarray(cv2.blur(cut, (2 * _RADIUS + 1, 2 * _RADIUS + 1)), np.float32)
+    smooth = np.asarray(cv2.blur(cut, (5, 5)), np.float32)
     return np.maximum(smooth, 0, out=smooth).reshape(variance.shape)
 
 

@@ -21,7 +21,7 @@ from nlm.fireflies import TOGETHER
 from nlm.gate import color_gate
 from nlm.pixel_filter import measure_alone, measure_correlation
 from nlm.pooling import RESIDUAL_LIMIT
-from nlm.samples import BLACK
+from nlm.samples import LEAST_ALBEDO
 from nlm.variance import second_differences
 
 # Rows to which frames are reduced for measuring: a mean of k×k pixels has a k-th of their noise, and a k²-th of their
@@ -72,17 +72,18 @@ AROUND, STRAIGHT = 16, 0.9
 NOISE_FREE = 1e-4
 # Rows and columns of areas over the lit part: their medians average noise.
 AREAS = 4, 6
-# Greatest share of the changes that a factor of the whole picture leaves in three quarters of the areas, and that of a
-# slight one: on rendered shots of 8 to 512 samples 0.59 to 1.2 are left where light moves, and of fades by 0.7 less
-# than 0.5 in 73 of 80. Factors of three channels are chosen where they leave less than LEFT of what one factor leaves.
+# A fade is accepted if one factor for the whole picture leaves less than `LEFT` of the change in three quarters of the
+# areas; a slight fade, less than `LEFT_SLIGHT`. On rendered shots of 8 to 512 samples 0.59 to 1.2 are left where light
+# moves, and less than 0.5 for 73 of 80 fades by 0.7. Factors of three channels are chosen where they leave less than
+# `LEFT` of what one factor leaves.
 LEFT, LEFT_SLIGHT = 0.5, 0.25
 # Logarithm of a fade that is slight: under one of 1.5 % that left 0.4 of the changes, a textured object in other light
 # lost 1.5 dB where the noise is 1 %.
 SLIGHT = 0.1
 # Least logarithm of a fade; least number of areas that show one.
 LEAST_FADE, LEAST_AREAS = 0.01, 6
-# A factor is certain beyond so many errors: the upper quartile of what it leaves in N areas, over √N. On rendered shots
-# of 8 to 512 samples without a fade it is at most 4.9 of them.
+# A fade is certain if its logarithm exceeds this many errors. The error is the upper quartile of the changes that the
+# fade leaves in N areas, over √N. Rendered shots of 8 to 512 samples without a fade reach 4.9.
 KNOWN = 6.0
 # Noise explains what is left up to so many standard errors of an area: without a fade 0.6 to 1.5 of them are left where
 # light stands still, and 2 to 20 where it moves.
@@ -424,10 +425,10 @@ def correlation_alone(frame: PreparedFrame) -> tuple[Correlation, float] | None:
         return None
     # Not by the floor of the irradiance, which leaves a part of the texture.
     light = channel_mean(
-        np.asarray(remodulate(frame.irradiance[block], albedo) / np.maximum(albedo, BLACK), np.float32)
+        np.asarray(remodulate(frame.irradiance[block], albedo) / np.maximum(albedo, LEAST_ALBEDO), np.float32)
     )
     gray = channel_mean(albedo)
-    contrast = np.abs(gray - cv2.blur(gray, (3, 3))) / np.maximum(gray, BLACK)
+    contrast = np.abs(gray - cv2.blur(gray, (3, 3))) / np.maximum(gray, LEAST_ALBEDO)
     texture = np.asarray(cv2.medianBlur(np.asarray(contrast, np.float32), 5), np.float32)  # without outlines
     surface = (frame.normal[block] != 0).any(axis=-1)
     level = np.abs(light)
@@ -492,7 +493,7 @@ def noise_free_around(frame: PreparedFrame, places: Places) -> Mask:
         shown = [color]
         if divisor is not None:
             color = color * divisor
-            shown = [color, color / np.maximum(divisor - np.float32(ALBEDO_FLOOR), BLACK)]
+            shown = [color, color / np.maximum(divisor - np.float32(ALBEDO_FLOOR), LEAST_ALBEDO)]
         for layer in shown:
             level = np.where(inside, layer.mean(axis=-1), np.float32(0))
             centre = level[:, 1:-1, 1:-1]

@@ -243,7 +243,7 @@ class AlignedWindow:
         Over noise that stands still those of the centre alone. Raises ValueError without a first pass.
         """
         if self.first_pass is None:
-            raise ValueError("aligned: expected a window with estimates, got none")
+            raise ValueError("aligned: expected a window with first passes, got none")
         weight = self.confidence if weight is None else weight
         if moves_over_noise(self.stages):
             weight = weight * (np.arange(len(weight)) == self.middle)[:, None, None]

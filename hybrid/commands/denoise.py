@@ -102,9 +102,9 @@ def denoise(
             strict=reading["strict"],
         )
         if (scheduler is not None or jobs > 1) and (options.budget is not None or options.breakdown is not None):
-            raise ValueError("--budget and --breakdown are of one process, expected no --scheduler or --jobs with them")
+            raise ValueError("--budget and --breakdown run in one process, expected neither --scheduler nor --jobs")
         if scheduler is not None and jobs > 1:
-            raise ValueError("--jobs are processes on this machine, expected no --scheduler with them")
+            raise ValueError("--jobs starts processes on this machine, expected it without --scheduler")
     source = shots.ShotInput(shot=shot, aovs=tuple(aov or ()), **reading)
     requests = Request(source, output, options, preview, contact_sheet, fps).of_views()
     if options.method == "network":

@@ -188,7 +188,7 @@ def named_first_pass(
         return replace(source, reason=reason, device=device)
     if spec == "bundled" or (spec == "auto" and backends.bundled is not None):
         if backends.bundled is None:
-            raise ImportError("first pass bundled: torch is needed, which this command does without; expected another")
+            raise ImportError("first pass bundled: expected another one, as this command runs without torch")
         run = partial(_denoise_turned, denoise=backends.bundled, quality=OIDN_MODES[mode]["quality"])
         reason = "asked for" if spec == "bundled" else f"{why_no_oidn()}; a network comes with ravg"
         return FirstPassSource("bundled", PerFrame(run, turns=True), reason)
@@ -273,7 +273,9 @@ class _KeptPictures:
         made_from = describe_sources(files, frame=frame.number, layers=layers, **self._facts)
         if why_stale(path, {MADE_FROM: made_from}, whole=False) is not None:
             if path.exists() and "estimate" not in sources_in(path):
-                raise ValueError(f"{path} is there, and no first pass that was kept: expected another place for them")
+                raise ValueError(
+                    f"{path} exists and was not written by --keep-first-pass: expected another folder or pattern"
+                )
             path.parent.mkdir(parents=True, exist_ok=True)
             shot.write(path, frame.number, {"color": run(frame, *noisy_guides)}, attributes={MADE_FROM: made_from})
         # Also a picture just written is read back, as it may be half: every run then sees the same.

@@ -44,8 +44,9 @@ WHITEN_ABOVE = 0.13
 # Its lower quartile over a frame alone: of independent noise in 910 frames of forty shots at most 0.11, and with the
 # filter [0.2 1 0.2] 0.25 in most; a kernel that is assumed wrongly costs 5 to 12 dB.
 WHITEN_ALONE_ABOVE = 0.17
-# The mean of that of pixels three and four apart: 0.02 by the filters of renderers, 0.05 by wider ones that can be
-# undone in part, 0.07 in frames of 80 pixels; errors of denoised pictures have 0.12 and more.
+# Mean correlation of the noise of pixels three and four apart, from which on the filter is not undone. Filters of
+# renderers cause 0.02, wider ones that can be undone in part 0.05, frames of 80 pixels 0.07; errors of denoised
+# pictures have 0.12 and more.
 WHITEN_BELOW = 0.09
 # Share of pixels, in areas of 9×9, whose brightness the vectors do not explain. To change them is worth its time for
 # reflections and shadows of some size; the gate is cheap and already pays for a small highlight.

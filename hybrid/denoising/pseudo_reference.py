@@ -87,7 +87,7 @@ def gated_average(aligned: AlignedWindow, *, timings: Timings | None = None) -> 
     has it, and 0.3 times the gate. Colors show which pixels of an outline are alike, geometry does not.
     """
     if aligned.first_pass is None:
-        raise ValueError("aligned: expected a window with estimates, got none")
+        raise ValueError("aligned: expected a window with first passes, got none")
     timings = timings or Timings()
     with timings.stage("average"):
         return average(aligned.first_pass, aligned.confidence) * aligned.modulation
@@ -104,7 +104,7 @@ def pool_and_denoise(aligned: AlignedWindow) -> Array:
     constant on thirteen shots.
     """
     if aligned.centre.first_pass is None:
-        raise ValueError("aligned: expected a window with estimates, got none")
+        raise ValueError("aligned: expected a window with first passes, got none")
     pooled = aligned.pool()
     mean = pooled.average * aligned.modulation
     albedo, normal = aligned.centre.guides.get("albedo"), aligned.centre.guides.get("normal")

@@ -287,7 +287,7 @@ def open_shot(
         Names of layers to read into `Frame.aovs`.
     keep : int, how many frames `Shot.read` holds in memory, to return them again
     max_pixels : int
-        Of the largest frame, see `hybrid.files.exr.read_exr`.
+        Pixels of the largest accepted frame, see `hybrid.files.exr.read_exr`.
 
     Raises
     ------

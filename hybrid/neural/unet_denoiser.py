@@ -14,7 +14,7 @@ from hybrid.denoising.stabilize import Denoised
 from hybrid.files.frame import Array
 from hybrid.neural.aovs import filter_aovs, share_out
 from hybrid.neural.network_denoiser import NetworkDenoiser, Setup, Tile, exposure_of
-from hybrid.neural.oidn_networks import HALO, has_oidn_networks, prefilter_guides
+from hybrid.neural.oidn_networks import HALO, TILE, has_oidn_networks, prefilter_guides
 from hybrid.neural.tiling import Block, tensor_of
 from network.robust_average import UNetWindow, pool
 from network.robust_unet import MIRRORED, RobustUNet, for_inference
@@ -39,7 +39,7 @@ class UNetDenoiser(NetworkDenoiser):
 
     needs_first_pass = True
     halo = HALO
-    default_tile = 2048  # 1920×1080 is one tile
+    default_tile = TILE
 
     def __init__(self, model: RobustUNet, setup: Setup) -> None:
         super().__init__(for_inference(model, setup.bfloat16), setup, SCRATCH[model.config.size])
@@ -52,7 +52,7 @@ class UNetDenoiser(NetworkDenoiser):
 
     def __call__(self, aligned: AlignedWindow) -> Denoised:
         if aligned.first_pass is None or aligned.centre.first_pass is None:
-            raise ValueError("estimate: expected those of the frames, as this network takes, got none")
+            raise ValueError("aligned: expected a window with first passes, got none")
         with self.setup.timings.stage("pool"):
             weights = self._weigh(aligned)
             guides = clean_guides(aligned) if self.model.config.clean_guides else aligned.centre.guides
@@ -150,5 +150,5 @@ def clean_guides(aligned: AlignedWindow) -> dict[str, Array]:
 def gain_of(aligned: AlignedWindow) -> torch.Tensor:
     """Factor of radiance before the transfer curve, (1,): in training and in running."""
     if aligned.centre.first_pass is None:
-        raise ValueError("aligned: expected a window with estimates, got none")
+        raise ValueError("aligned: expected a window with first passes, got none")
     return torch.tensor([measure_gain(aligned.centre.first_pass)], dtype=torch.float32)

@@ -81,7 +81,7 @@ class DenoiseOptions:
     reuse_freed_memory : bool
         Let the process keep memory that it frees, which saves a sixth of the CPU time.
     threads : int or None
-        Of numba, OpenCV and torch in this process; None leaves them as they are.
+        Threads of numba, OpenCV and torch in this process; None leaves them unchanged.
     """
 
     method: str = ""

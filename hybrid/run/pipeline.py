@@ -91,9 +91,9 @@ def denoise_frames(
     """Denoise every frame of a shot and write it; yield `Finished`, or `Failed` with `keep_going`, in their order.
 
     Most often a frame is yielded when the next one has been denoised. The views are the shot and further pictures of
-    the same files, each with a window of its own; a file is written once. While a frame is denoised, the one before it
-    is written in one thread; after it is denoised, the next one that its successor needs is read in another: memory is
-    at its fullest while a denoiser runs. Files that earlier processes have left half written are removed.
+    the same files, each with a window of its own; a file is written once. While a frame is denoised, one thread writes
+    the frame before it. After that, another thread reads the next frame that is needed; not earlier, because memory use
+    is greatest while a denoiser runs. Files that earlier processes have left half written are removed.
 
     Raises ValueError if a frame would be written over its own input, or its result cannot be right: it is not finite,
     or its light is not that of the noisy frame (`hybrid.checks.validation.find_lost_light`).

@@ -116,7 +116,7 @@ def test_a_window_without_estimates_is_an_error(tmp_path) -> None:
     shot = open_shot(SCENE.write(tmp_path))
     aligned = FrameStream(shot, only(STAGES)).align(MIDDLE)
     assert aligned.residual is None
-    with pytest.raises(ValueError, match="expected a window with estimates"):
+    with pytest.raises(ValueError, match="expected a window with first passes"):
         pool_and_denoise(aligned)
 
 

@@ -189,7 +189,7 @@ def test_estimates_that_are_not_finite_are_repaired_and_others_refused(tmp_path)
         FrameStream(shot, only(STAGES), first_pass=PerFrame(lambda frame: np.ones((3, 4, 3), np.float32))).align(MIDDLE)
     with pytest.raises(ValueError, match=f"frame {MIDDLE} has no first pass"):
         FrameStream(shot, only(STAGES), first_pass=PerFrame(lambda frame: None)).align(MIDDLE)
-    with pytest.raises(ValueError, match="expected a window with estimates"):
+    with pytest.raises(ValueError, match="expected a window with first passes"):
         gated_average(FrameStream(shot, only(STAGES)).align(MIDDLE))
 
 
@@ -269,7 +269,7 @@ def test_pictures_that_are_kept_are_made_again_where_they_would_be_others(tmp_pa
     assert run() == 1
     mine = kept / f"shot.{MIDDLE}.exr"
     mine.write_bytes((folder / mine.name).read_bytes())
-    with pytest.raises(ValueError, match="is there, and no first pass that was kept"):
+    with pytest.raises(ValueError, match="exists and was not written by --keep-first-pass"):
         run()
     assert mine.read_bytes() == (folder / mine.name).read_bytes()
 

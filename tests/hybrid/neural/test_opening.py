@@ -55,5 +55,5 @@ def test_memory_of_a_first_pass_is_that_of_a_tile_with_its_halo(monkeypatch):
 def test_a_network_that_needs_a_first_pass_says_so(tmp_path):
     shot = open_shot(Scene(frames=5).write(tmp_path))
     window = FrameStream(shot, only({"warp"})).align(shot.numbers[2])
-    with pytest.raises(ValueError, match="estimate: expected those of the frames, as this network takes, got none"):
+    with pytest.raises(ValueError, match="aligned: expected a window with first passes, got none"):
         open_network(shipped_weights("balanced"))(window)
