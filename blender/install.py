@@ -24,7 +24,7 @@ _FOR_CPUS, _FOR_GPUS = (0.4, 1.8), (3.0, 6.3)
 
 
 class Source(NamedTuple):
-    version: str  # of this extension, such as 0.2.0
+    version: str  # of this extension, such as 1.0.0
     wheel: Path | None  # of ravg; its requirements are taken from wheels in its folder
     online: bool  # whether requirements may come from the package index too
     gpu: bool  # whether torch is to compute on GPUs: on Linux alone, pip's torch for other systems is for CPUs
