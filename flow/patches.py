@@ -152,7 +152,8 @@ class Patches:
         for axis in (0, 1):
             steps[:] = np.eye(2)[axis]
             costs.append(self._costs((1, 1), steps, self.all))
-        return float(np.nanmean(costs))
+        known = np.isfinite(costs)
+        return float(np.mean(costs, where=known)) if known.any() else 0.0
 
     def length(self, convention: MotionConvention) -> float:
         """Ninth decile of the lengths of the vectors, pixels; 0 without any."""

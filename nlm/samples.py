@@ -234,8 +234,9 @@ def _light_around(picture: Floats, noisy: Floats, others: Floats, exposure: floa
 
 def _relative_light(noisy: Floats, neighbours: SampleMean, rate: Floats) -> list[Floats]:
     """Light of a frame over the light of its neighbours (H, W), by least squares around each pixel, over two sizes."""
-    weight = np.square(rate) * neighbours.trust
-    products = [weight * np.einsum("yxc,yxc->yx", layer, neighbours.mean) for layer in (noisy, neighbours.mean)]
+    weight = rate * neighbours.trust
+    near = rate[..., None] * neighbours.mean  # the square of the rate may overflow
+    products = [weight * np.einsum("yxc,yxc->yx", layer, near) for layer in (noisy, neighbours.mean)]
     factors = []
     for sigma in (_SIGMA, _LIGHT):
         together, alone = (gaussian_mean(product, sigma) for product in products)

@@ -323,7 +323,7 @@ class _Report:
         """Add a frame; return the message of the progress bar."""
         if isinstance(frame, Failed):
             message = one_line(frame.error)
-            LOG.error(f"frame {frame.number}: {message}")
+            LOG.error(_describe(frame))
             self.record.add(frame.number, "failed", error=message)
             self.record.write(self.job.timings)
             return f"frame {frame.number} failed"
@@ -351,7 +351,7 @@ class _Report:
             if other.number not in self.lost:
                 self.lost.add(other.number)
                 LOG.warning(
-                    f"frame {other.number}: {one_line(other.error)}; the frames beside it are made without it, "
+                    f"{_describe(other)}; the frames beside it are made without it, "
                     "and again by --resume once it is whole"
                 )
         if frame.again:
@@ -359,7 +359,8 @@ class _Report:
         if frame.fireflies:
             LOG.debug(f"{name}: {frame.fireflies} fireflies removed, {share:.2%} of its light")
         if frame.repaired:
-            LOG.warning(f"{name}: {frame.repaired} pixels were not finite, filled in from neighbours; check the render")
+            lost = f"{frame.repaired} pixels were not finite or beyond 1e14"
+            LOG.warning(f"{name}: {lost}, filled in from neighbours; check the render")
         if frame.clamped:
             LOG.warning(f"{name}: {frame.clamped} values too large for half, written as 65504; 32-bit input keeps them")
 
@@ -429,3 +430,9 @@ def _write_pictures(request: Request, shot: Shot, finished: Collection[int]) -> 
     if request.contact_sheet is not None and shot.numbers:
         write_contact_sheet(shot, request.output, request.contact_sheet)
         LOG.info(f"wrote {request.contact_sheet}")
+
+
+def _describe(frame: Failed) -> str:
+    """The error of a frame with its number, which the error may name itself."""
+    name = f"frame {frame.number}: "
+    return name + one_line(frame.error).removeprefix(name)

@@ -196,6 +196,8 @@ class FrameDenoiser:
         stream, numbers = self.stream, self.stream.around(number)
         window: Window | None = stream.window(number)
         assert window is not None
+        if not window.centre.valid.any():
+            raise ValueError(f"frame {number}: no pixel of color is finite, expected a rendered frame")
         plan = stream.plan(numbers, stream.context(number, window.first_pass is not None, stream.radius))
         brightest = 0.0
         for frame in window.frames:

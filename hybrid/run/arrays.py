@@ -107,7 +107,8 @@ class ArrayFrames:
             if layer.dtype.kind != "f":
                 expected = "float radiance, scene-linear" if name in ("color", "estimate") else "float"
                 raise ValueError(f"frame {number}: {name} has type {layer.dtype}, expected {expected}")
-        return {name: np.asarray(layer, np.float32) for name, layer in arrays.items()}
+        # Compiled loops take no read-only arrays, and torch takes no negative strides.
+        return {name: np.require(layer, np.float32, ["C", "W"]) for name, layer in arrays.items()}
 
 
 def _as_aov(layer: Array) -> Array:
@@ -244,8 +245,6 @@ def denoise_arrays(
             warnings.warn(doubt, stacklevel=2)
         for number in wanted:
             frame = denoise.make(number)
-            if frame.repaired == np.prod(shot.shape):
-                warnings.warn(f"frame {number}: no pixel of color is finite; expected a rendered frame", stacklevel=2)
             layers = {"color": frame.denoised.color, **frame.denoised.aovs, **shot.kept(number)}
             result = ArrayResult(number, layers, frame.plan)
             yield result

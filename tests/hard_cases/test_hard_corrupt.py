@@ -110,9 +110,24 @@ def test_each_frame_with_lost_pixels_is_told_of_once(tmp_path, capsys):
     assert main(["denoise", str(folder), "-o", str(tmp_path / "out"), "--preset", "draft"]) == 0
     said = [line for line in capsys.readouterr().err.splitlines() if "not finite" in line]
     assert said == [
-        "warning: frame 1001: 3 pixels were not finite, filled in from neighbours; check the render",
-        "warning: frame 1002: 4 pixels were not finite, filled in from neighbours; check the render",
+        "warning: frame 1001: 3 pixels were not finite or beyond 1e14, filled in from neighbours; check the render",
+        "warning: frame 1002: 4 pixels were not finite or beyond 1e14, filled in from neighbours; check the render",
     ]
+
+
+def test_a_frame_without_a_finite_pixel_fails_as_a_damaged_one(tmp_path, capsys):
+    def lose(index, layers):
+        if index == 1:
+            layers["ViewLayer.Combined"][:] = np.nan
+
+    folder, out = Scene().write(tmp_path / "in", edit=lose), tmp_path / "out"
+    assert main(["denoise", str(folder), "-o", str(out), "--preset", "draft", "--keep-going"]) == 1
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error")]
+    assert said == [
+        "error: frame 1002: no pixel of color is finite, expected a rendered frame",
+        "error: 1 frames could not be made: 1002",
+    ]
+    assert len(list(out.glob("*.exr"))) == len(list(folder.glob("*.exr"))) - 1
 
 
 @lru_cache

@@ -176,13 +176,29 @@ def test_vectors_along_which_frames_do_not_match_are_reported_once(vector, words
     assert all(words in str(warning.message) and warning.filename == __file__ for warning in found)
 
 
-def test_a_frame_without_a_finite_pixel_is_reported():
+def test_a_frame_without_a_finite_pixel_is_refused_and_its_neighbours_are_made_without_it():
     frames = {number: {"color": np.ones((16, 24, 3))} for number in (4, 5, 6)}
     frames[4]["color"][3:] = np.nan
     frames[5]["color"][:] = np.nan
-    with pytest.warns(UserWarning, match="frame 5: no pixel of color is finite") as found:
-        list(ravg.denoise_arrays(frames, preset="draft"))
-    assert len(found) == 1
+    with pytest.raises(ValueError, match="frame 5: no pixel of color is finite"):
+        list(ravg.denoise_arrays(frames, preset="draft", numbers=[5]))
+    made = list(ravg.denoise_arrays(frames, preset="draft", numbers=[4, 6]))
+    assert all((result.layers["color"] == 1).all() for result in made)
+
+
+@pytest.mark.parametrize("change", [lambda x: x[::-1].copy()[::-1], lambda x: np.frombuffer(x.tobytes(), x.dtype)])
+@pytest.mark.parametrize("layer", ["color", "albedo", "normal"])
+@pytest.mark.neural
+def test_flipped_and_read_only_arrays_are_read_as_copies_of_them(change, layer):
+    layers = {"color": np.float32(0.5), "albedo": np.float32(0.3), "normal": np.float32(0.6)}
+    generator = np.random.default_rng(3)
+    frames = [
+        {name: generator.uniform(0, 1, (16, 24, 3)).astype(np.float32) * value for name, value in layers.items()}
+        for _ in range(3)
+    ]
+    changed = [{**frame, layer: change(frame[layer]).reshape(frame[layer].shape)} for frame in frames]
+    images = ([result.layers["color"] for result in ravg.denoise_arrays(given)] for given in (frames, changed))
+    np.testing.assert_array_equal(*map(np.stack, images))
 
 
 def test_frames_of_another_size_are_refused():
