@@ -282,7 +282,7 @@ def test_the_variance_of_the_renderer_counts_where_no_frame_beside_does() -> Non
     np.testing.assert_array_equal(blend_samples(smooth, own, alone, 0.5, unsure), smooth)
 
 
-@pytest.mark.parametrize("scale", [2.0**-20, 2.0**20])
+@pytest.mark.parametrize("scale", [2.0**-63, 2.0**-20, 2.0**20])
 def test_both_corrections_scale_with_the_light(scale: float) -> None:
     truth = lines()
     own, sides = window(truth, 0.1)
