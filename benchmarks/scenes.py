@@ -267,9 +267,9 @@ def chandelier() -> None:
     shoot(29, ((-1.0, -2.4, 1.7), (-0.65, -2.4, 1.75)), ((-0.05, 0.4, 2.08), (-0.02, 0.4, 2.08)))
 
 
-def waves(surface: Any, size: float, count: int, rng: Random) -> Any:
+def waves(surface: Any, rng: Random) -> Any:
     """Add a square of water whose shape keys are travelling waves, two keys for all waves of one frequency."""
-    item = add("grid", surface, size=size, x_subdivisions=count, y_subdivisions=count)
+    item = add("grid", surface, size=6, x_subdivisions=300, y_subdivisions=300)
     item.shape_key_add(name="flat")
     still = np.array([corner.co for corner in item.data.vertices])
     for length in (1.3, 0.7, 0.4, 0.22):
@@ -292,7 +292,7 @@ def water() -> None:
     tile = pattern(material(roughness=0.2), "Brick", 1, (0.5, 0.52, 0.5), (0.08, 0.4, 0.5), **TILE)
     stone = pattern(material(), "Noise", 6, (0.4, 0.36, 0.3), (0.6, 0.56, 0.48), Detail=8)
     hedge = pattern(material(roughness=0.9), "Noise", 14, (0.01, 0.04, 0.01), (0.1, 0.22, 0.05), Detail=6)
-    surface, sides = waves(glass(1.33), 6, 300, Random(4)), [add("plane", tile, (0, 0, -0.8), size=6)]
+    surface, sides = waves(glass(1.33), Random(4)), [add("plane", tile, (0, 0, -0.8), size=6)]
     for k in range(4):
         x, y = sin(k * pi / 2), cos(k * pi / 2)
         sides.append(add("plane", tile, (3 * x, 3 * y, -2.95), (pi / 2, 0, -k * pi / 2), size=6))

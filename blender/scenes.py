@@ -83,7 +83,7 @@ def _of_passes(scene: bpy.types.Scene) -> Iterator[Problem]:
         yield Problem("Motion Blur leaves the Vector pass empty: nothing would seem to move", True)
     elif not render.use_motion_blur and not all(vectors):
         yield Problem("Vector pass is off: motion has to be found in the pictures", True)
-    if not (scene.cycles.use_animated_seed or _is_animated(scene, "cycles.seed")):
+    if not _has_seeds(scene):
         yield Problem("Seed is constant: noise that stands still cannot be averaged away", True)
     if _wrong_denoise(scene):
         text = "Render > Denoise is off: Fast is more accurate with Blender's own denoised frames"
@@ -111,7 +111,7 @@ def set_up(scene: bpy.types.Scene) -> list[str]:
         if layer.use_pass_vector == render.use_motion_blur:
             layer.use_pass_vector = not render.use_motion_blur
             changed.append(f"{'Vector' if layer.use_pass_vector else 'no Vector'} of {layer.name}")
-    if not (scene.cycles.use_animated_seed or _is_animated(scene, "cycles.seed")):
+    if not _has_seeds(scene):
         scene.cycles.use_animated_seed = True
         changed.append("Animate Seed")
     if _wrong_denoise(scene):
@@ -466,9 +466,11 @@ def _light_passes(layer: bpy.types.ViewLayer) -> bool:
     return any(getattr(layer, name) for name in dir(layer) if re.fullmatch(named, name))
 
 
-def _is_animated(scene: bpy.types.Scene, path: str) -> bool:
-    """Whether a property of the scene has a driver or keys."""
+def _has_seeds(scene: bpy.types.Scene) -> bool:
+    """Whether each frame has a seed of its own: by the switch, or by a driver or keys."""
     data = scene.animation_data
+    if scene.cycles.use_animated_seed:
+        return True
     if data is None:
         return False
     curves = list(data.drivers)
@@ -478,7 +480,7 @@ def _is_animated(scene: bpy.types.Scene, path: str) -> bool:
         else:  # Blender 5.0 and later keep them in layers
             bags = [bag for layer in data.action.layers for strip in layer.strips for bag in strip.channelbags]
             curves += [curve for bag in bags for curve in bag.fcurves]
-    return any(curve.data_path == path for curve in curves)
+    return any(curve.data_path == "cycles.seed" for curve in curves)
 
 
 def absolute(path: str) -> Path:

@@ -73,7 +73,7 @@ class Patches:
         everywhere = (np.ones_like(self.shown[0]),) * 2
         unmoved = np.zeros((len(self.rows) * self.size, self.size, 2), np.float32)
         self.still = self._costs((1, 0), unmoved, self.all, shown=everywhere)
-        self.few = _informative(self.still, SCREENED)
+        self.few = _informative(self.still)
         self.vectors = [self.gather(layer, self.all) for layer in layers]
         self.few_vectors = [self.gather(layer, self.few) for layer in layers]
         self.tried: dict[tuple[MotionConvention, bool], np.ndarray] = {}
@@ -249,10 +249,11 @@ def mean_cost(costs: np.ndarray, still: np.ndarray) -> float:
     return float(np.where(inside, costs, factor * still).mean())
 
 
-def _informative(still: np.ndarray, count: int) -> np.ndarray:
-    """Indices of patches: half of them those that change most, half spread evenly."""
-    if len(still) <= count:
+def _informative(still: np.ndarray) -> np.ndarray:
+    """Indices of `SCREENED` patches: half of them those that change most, half spread evenly."""
+    if len(still) <= SCREENED:
         return np.arange(len(still))
-    changing = np.argpartition(still, -(count // 2))[-(count // 2) :]
-    spread = np.linspace(0, len(still) - 1, count - count // 2).round().astype(int)
+    half = SCREENED // 2
+    changing = np.argpartition(still, -half)[-half:]
+    spread = np.linspace(0, len(still) - 1, half).round().astype(int)
     return np.union1d(changing, spread)

@@ -107,7 +107,7 @@ class OidnUNet(nn.Module):
     def input_skip(self, x: Tensor) -> Tensor:
         """Skip connection from the network's input; in bfloat16 with the low bits of the color (`round_unet`)."""
         if self.first.weight.dtype == torch.bfloat16:
-            return x if x.dtype == torch.bfloat16 else with_low_bits(x, 3)
+            return x if x.dtype == torch.bfloat16 else with_low_bits(x)
         return x.to(self.first.weight.dtype, memory_format=torch.channels_last)
 
     def project(self, x: Tensor) -> Tensor:

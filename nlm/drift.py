@@ -75,7 +75,7 @@ def drift_weights(
     return weight
 
 
-def pull_to_centre(estimates: Floats, confidence: Floats, weight: Floats, rows: slice = slice(None)) -> None:
+def pull_to_centre(estimates: Floats, confidence: Floats, weight: Floats) -> None:
     """Pull estimates to the centre's, in place, so that their average is as if confidence were multiplied.
 
     Samples and all else that is averaged keep their confidence: e_s becomes e_t + m_s (e_s − e_t), m_s = w_s Σ c / Σ c
@@ -86,10 +86,8 @@ def pull_to_centre(estimates: Floats, confidence: Floats, weight: Floats, rows: 
     estimates : (T, H, W, 3) float32
     confidence : (T, H, W) float32
     weight : (T, H, W) float32, the factor, from `drift_weights`
-    rows : slice, those that are pulled; all, if not given
     """
-    top, bottom, _ = rows.indices(estimates.shape[1])
-    run_bands(_pull, bottom - top, estimates, confidence, weight, top)
+    run_bands(_pull, estimates.shape[1], estimates, confidence, weight)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -138,11 +136,11 @@ def _hold_out(
 
 
 @njit(cache=True, nogil=True)
-def _pull(first: int, last: int, estimates: Floats, confidence: Floats, weight: Floats, top: int) -> None:
-    """Write centre + m (estimate − centre) into the estimates of the rows from `top` on."""
+def _pull(first: int, last: int, estimates: Floats, confidence: Floats, weight: Floats) -> None:
+    """Write centre + m (estimate − centre) into the estimates."""
     T, _, W, _ = estimates.shape
     middle = T // 2
-    for y in range(top + first, top + last):
+    for y in range(first, last):
         for x in range(W):
             total, left = np.float32(0), np.float32(0)
             for t in range(T):

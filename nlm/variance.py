@@ -108,22 +108,17 @@ def smooth_variance(variance: Floats) -> Floats:
     return np.maximum(smooth, 0, out=smooth).reshape(variance.shape)
 
 
-def prefilter_guide(guides: Floats, confidence: Floats) -> Floats:
+def prefilter_guide(centre: Floats, read: Callable[[slice], Floats], confidence: Floats) -> Floats:
     """Denoise the centre frame's guides: albedo and normals under depth of field or behind glass.
 
-    Guides (T, H, W, F) of about unit range without noise come back as they are, to about 1e-3.
+    Guides (H, W, F) of about unit range without noise come back as they are, to about 1e-3. `read` returns the window
+    (T, h, W, F) of rows around noise that the guides show.
 
     Non-local means over 3×3 pixels and all frames. The variance is the lesser of that between frames and
     that of the spatial residual: noise shows in both, texture only in the second, and texture resampled by warping
     mainly in the first. A radius above 1 gains nothing on Cycles shots. Tiles of the picture without noise are left
     out.
     """
-    guides, confidence = check_window(guides, confidence, "confidence")
-    return prefilter_noisy_rows(guides[len(guides) // 2], lambda rows: guides[:, rows], confidence)
-
-
-def prefilter_noisy_rows(centre: Floats, read: Callable[[slice], Floats], confidence: Floats) -> Floats:
-    """As `prefilter_guide`; `read` returns the window (T, h, W, F) of rows around noise that the guide shows."""
     spatial, filtered = variance_from_residual(centre), centre.copy()
     for rows in _around(spatial.max(axis=(1, 2)) > _NOISELESS):
         window = read(rows)

@@ -16,7 +16,7 @@ from hybrid.files.frame import Array
 from loops.parallel import STRIP, Mask
 from nlm.pooling import PooledSamples, pool_samples
 from nlm.samples import SampleMean
-from nlm.variance import prefilter_noisy_rows, smooth_variance, variance_from_window
+from nlm.variance import prefilter_guide, smooth_variance, variance_from_window
 
 
 def _nothing() -> None:
@@ -288,4 +288,4 @@ def clean_guide(
     guide = guides[name]
     if "prefilter" not in stages:
         return guide
-    return prefilter_noisy_rows(guide, partial(sources.warp, name, guide), confidence)
+    return prefilter_guide(guide, partial(sources.warp, name, guide), confidence)

@@ -26,13 +26,12 @@ class ClassicalPreset:
     # search radius and patch radius of the non-local means, pixels; search radius 0: the robust average alone
     nlm_radius: int
     nlm_patch_radius: int
-    guided_radius: int  # radius of the guided filter that follows, pixels; 0: none
-    guided_eps: float  # regularisation of the guided filter, relative to the guides' scale
+    guided_eps: float  # regularisation of the guided filter that follows, relative to the guides' scale
 
 
-DRAFT = ClassicalPreset("draft", 0, 0, guided_radius=1, guided_eps=1e-3)
-STANDARD = ClassicalPreset("standard", 3, 2, guided_radius=1, guided_eps=1e-2)
-FINAL = ClassicalPreset("final", 5, 2, guided_radius=1, guided_eps=1e-2)
+DRAFT = ClassicalPreset("draft", 0, 0, guided_eps=1e-3)
+STANDARD = ClassicalPreset("standard", 3, 2, guided_eps=1e-2)
+FINAL = ClassicalPreset("final", 5, 2, guided_eps=1e-2)
 CLASSICAL_PRESETS = {preset.name: preset for preset in (DRAFT, STANDARD, FINAL)}
 
 
@@ -60,23 +59,22 @@ def filter_window(
                 radius=min(preset.nlm_radius, most),
                 patch_radius=min(preset.nlm_patch_radius, most),
             )
-    if preset.guided_radius:
-        with timings.stage("guided"):
-            guides = [] if aligned.guide is None else [aligned.guide]
-            if preset.nlm_radius:
-                # Edges of shadows and highlights are in no guide, but in the result of the non-local means. Without
-                # this channel the filter lost 2 dB on a sunlit shot.
-                light = irradiance.mean(axis=-1, keepdims=True)
-                guides.append(compress(light, aligned.brightness.exposure))
-            if guides:
-                guide = np.concatenate(guides, axis=-1)
-                irradiance = guided_filter(
-                    irradiance,
-                    guide,
-                    radius=preset.guided_radius,
-                    eps=preset.guided_eps,
-                    moments=aligned.brightness.moments[:, : guide.shape[-1]],
-                )
+    with timings.stage("guided"):
+        guides = [] if aligned.guide is None else [aligned.guide]
+        if preset.nlm_radius:
+            # Edges of shadows and highlights are in no guide, but in the result of the non-local means. Without this
+            # channel the filter lost 2 dB on a sunlit shot.
+            light = irradiance.mean(axis=-1, keepdims=True)
+            guides.append(compress(light, aligned.brightness.exposure))
+        if guides:
+            guide = np.concatenate(guides, axis=-1)
+            irradiance = guided_filter(
+                irradiance,
+                guide,
+                radius=1,
+                eps=preset.guided_eps,
+                moments=aligned.brightness.moments[:, : guide.shape[-1]],
+            )
     return irradiance * aligned.modulation
 
 

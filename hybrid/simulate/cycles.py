@@ -23,10 +23,9 @@ import numpy as np
 import OpenEXR
 
 from hybrid.simulate import scenes
-from hybrid.simulate.effects import EVERYTHING, PASSES, effects_of, facts_of, needed_bounces, settings_of
+from hybrid.simulate.effects import EVERYTHING, PASSES, PILOT_SAMPLES, effects_of, facts_of, needed_bounces, settings_of
 from hybrid.simulate.shot import RANDOM, ShotSettings, frame_seed
 
-PILOT_SAMPLES = 8
 PILOT_PIXELS = 2400  # with 8 samples 19 thousand paths: a few tenths of a second, most of it to set up
 SAMPLES = "cycles.ViewLayer.samples"  # Cycles' header attribute; it counts one render, which may be a part
 
@@ -88,7 +87,7 @@ def read_channels(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         return dict(file.header()), {name: np.array(channel.pixels) for name, channel in file.channels().items()}
 
 
-def render_small(scene: Any, settings: dict[str, Any], samples: int, seed: int) -> dict[str, np.ndarray]:
+def render_small(scene: Any, settings: dict[str, Any], seed: int) -> dict[str, np.ndarray]:
     """Render a pilot of about `PILOT_PIXELS` with `settings` applied; return its passes by name, (H, W, C) each."""
     render = scene.render
     fraction = 1.0
@@ -100,7 +99,7 @@ def render_small(scene: Any, settings: dict[str, Any], samples: int, seed: int) 
     try:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "pilot.exr"
-            render_frame(scene, path, samples, seed)
+            render_frame(scene, path, PILOT_SAMPLES, seed)
             channels = read_channels(path)[1]
     finally:
         render.resolution_percentage = 100
@@ -116,7 +115,7 @@ def pilot(scene: Any, frames: list[int], settings: dict[str, Any], seed: int) ->
     images = []
     for frame in frames:
         scene.frame_set(frame)
-        images.append(render_small(scene, settings, PILOT_SAMPLES, seed)["Combined"][..., :3])
+        images.append(render_small(scene, settings, seed)["Combined"][..., :3])
     return np.concatenate(images).astype(np.float32)
 
 
@@ -143,7 +142,7 @@ def make_plan(shot: ShotSettings, threads: int) -> dict[str, Any]:
         scene.frame_set(shot.middle)
         if shot.scene not in RANDOM:
             break
-        passes = render_small(scene, {}, PILOT_SAMPLES, 1)
+        passes = render_small(scene, {}, 1)
         rejected = scenes.rejection(passes)
         if rejected is None:
             exposure = {"cycles.film_exposure": scenes.exposure(shot, passes)}
@@ -162,7 +161,7 @@ def make_plan(shot: ShotSettings, threads: int) -> dict[str, Any]:
         both_ends = moves and work > 30e6  # samples
         frames = sorted({shot.frames[0], shot.frames[-1]}) if both_ends else [shot.middle]
         cleanest = max([*shot.levels.values(), shot.reference])
-        bounces = needed_bounces(lambda s, seed: pilot(scene, frames, s, seed), settings, PILOT_SAMPLES, cleanest)
+        bounces = needed_bounces(lambda s, seed: pilot(scene, frames, s, seed), settings, cleanest)
         decisions += bounces
         settings = settings_of(bounces, settings)
     settings |= exposure

@@ -36,6 +36,7 @@ MIRROR_ROUGHNESS = 0.2  # at roughness 0.2 the lobe is some 5° wide: light it f
 MEAN_FRACTION = 0.0005
 NOISE_FRACTION = 0.1
 BLOCK = 8  # pixels
+PILOT_SAMPLES = 8
 
 
 @dataclass(frozen=True)
@@ -138,11 +139,11 @@ def settings_of(decisions: Iterable[EffectDecision], base: dict[str, Any] | None
 
 
 def needed_bounces(
-    render: Callable[[dict[str, Any], int], np.ndarray], settings: dict[str, Any], samples: int, target_samples: int
+    render: Callable[[dict[str, Any], int], np.ndarray], settings: dict[str, Any], target_samples: int
 ) -> list[EffectDecision]:
     """Measure how many bounces an image needs: all together, and of each kind that `settings` allow.
 
-    `render(settings, seed)` returns a pilot, (H, W, 3) float32 linear radiance, of `samples` samples per pixel; the
+    `render(settings, seed)` returns a pilot, (H, W, 3) float32 linear radiance, of `PILOT_SAMPLES` per pixel; the
     same seed must give the same paths. `target_samples` are those of the cleanest image to be rendered.
 
     With one seed, an image of depth d and one of unlimited depth share all paths up to d, so their difference Δ is the
@@ -157,7 +158,7 @@ def needed_bounces(
     would dominate second ones. All bounces together are decided first, which leaves few depths to try for each kind.
     """
     full = render(settings, 1)
-    noise = float(np.mean(np.abs(full - render(settings, 2)))) / np.sqrt(2) * np.sqrt(samples / target_samples)
+    noise = float(np.mean(np.abs(full - render(settings, 2)))) / np.sqrt(2) * np.sqrt(PILOT_SAMPLES / target_samples)
     mean = float(np.mean(full))
 
     def lost(complete: np.ndarray, trial: dict[str, Any]) -> tuple[float, float]:

@@ -25,19 +25,16 @@ def can_fuse(x: Tensor) -> bool:
     return x.dtype in _FUSED and not torch.is_grad_enabled() and x.device.type == "cpu"
 
 
-def convolve(
-    x: Tensor, weight: Tensor, bias: Tensor | None, added: Tensor | None = None, *, relu: bool = True
-) -> Tensor:
+def convolve(x: Tensor, weight: Tensor, bias: Tensor | None, added: Tensor | None = None) -> Tensor:
     """Convolve ``(N, C, H, W)`` by ``(O, C, 3, 3)``, add, overwriting `added` (channels last), apply a ReLU."""
     if not can_fuse(x):
         result = functional.conv2d(x, weight, bias, padding=1)
-        result = result if added is None else added.add_(result)
-        return torch.relu_(result) if relu else result
+        return torch.relu_(result if added is None else added.add_(result))
     if can_transform(x, weight):
-        return convolve_transformed(x, weight, bias, added, relu=relu)
-    one, name, rest = [1, 1], "relu" if relu else None, (list[float](), "")
+        return convolve_transformed(x, weight, bias, added, relu=True)
+    one, rest = [1, 1], ("relu", list[float](), "")
     operation = weight, bias, one, one, one, 1  # padding, stride and dilation; groups
     if added is None:
-        return cast(Tensor, torch.ops.mkldnn._convolution_pointwise(x, *operation, name or "none", *rest))
+        return cast(Tensor, torch.ops.mkldnn._convolution_pointwise(x, *operation, *rest))
     x = x.contiguous(memory_format=torch.channels_last)  # the memory format of `added`
-    return cast(Tensor, torch.ops.mkldnn._convolution_pointwise_.binary(added, x, *operation, "add", 1.0, name, *rest))
+    return cast(Tensor, torch.ops.mkldnn._convolution_pointwise_.binary(added, x, *operation, "add", 1.0, *rest))

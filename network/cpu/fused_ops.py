@@ -50,14 +50,14 @@ def halve(x: Tensor) -> Tensor:
     return result.permute(0, 3, 1, 2)
 
 
-def with_low_bits(x: Tensor, colors: int) -> Tensor:
-    """Round float32 ``(N, C, H, W)`` to bfloat16; the first channels' rounding errors become further channels."""
+def with_low_bits(x: Tensor) -> Tensor:
+    """Round float32 ``(N, C, H, W)`` to bfloat16; the rounding errors of the first three become further channels."""
     if not can_project(x):
         rounded = x.to(torch.bfloat16, memory_format=torch.channels_last)
-        return torch.cat([rounded, (x[:, :colors] - rounded[:, :colors]).to(rounded.dtype)], 1)
+        return torch.cat([rounded, (x[:, :3] - rounded[:, :3]).to(rounded.dtype)], 1)
     pixels = x.permute(0, 2, 3, 1).contiguous()
     *size, channels = pixels.shape
-    result = torch.empty(*size, channels + colors, dtype=torch.bfloat16)
+    result = torch.empty(*size, channels + 3, dtype=torch.bfloat16)
     rows = [layer.numpy().reshape(-1, *layer.shape[2:]) for layer in (pixels, result.view(torch.uint16))]
     run_bands(_split, len(rows[0]), rows[0], rows[0].view(np.uint32), rows[1])
     return result.permute(0, 3, 1, 2)

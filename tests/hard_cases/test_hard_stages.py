@@ -247,7 +247,7 @@ def test_non_local_means_are_convex(drawn, level, radius, patch):
 @given(images(3, frames=3, negative=True))
 def test_prefiltered_guides_are_in_range(drawn):
     guides, rng = drawn
-    out = variances.prefilter_guide(guides, weights(rng, guides.shape[:3]))
+    out = variances.prefilter_guide(guides[1], lambda rows: guides[:, rows], weights(rng, guides.shape[:3]))
     assert between(out, guides.min(), guides.max())
 
 

@@ -92,12 +92,8 @@ def test_pulling_is_averaging_with_other_weights(rng):
     weight = rng.uniform(0.05, 1, confidence.shape).astype(np.float32)
     weight[3] = 1
     expected = average(estimates, confidence * weight)
-    centre, pulled = estimates[3].copy(), estimates.copy()
+    centre = estimates[3].copy()
     pull_to_centre(estimates, confidence, weight)
-    for rows in (slice(0, 7), slice(7, 40)):  # the last may end beyond the frame
-        assert (pulled[0, rows] != estimates[0, rows]).any()
-        pull_to_centre(pulled, confidence, weight, rows)
-    np.testing.assert_array_equal(pulled, estimates)
     np.testing.assert_allclose(average(estimates, confidence), expected, atol=1e-5)
     np.testing.assert_array_equal(estimates[3], centre)
 

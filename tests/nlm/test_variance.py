@@ -3,7 +3,6 @@ import pytest
 
 from nlm.variance import (
     prefilter_guide,
-    prefilter_noisy_rows,
     smooth_variance,
     variance_from_halves,
     variance_from_residual,
@@ -76,11 +75,15 @@ def test_scale_constants_and_order():
     np.testing.assert_allclose(smooth_variance(flat), 0.3, rtol=1e-6)
 
 
+def prefilter_window(guides, confidence):
+    return prefilter_guide(guides[len(guides) // 2], lambda rows: guides[:, rows], confidence)
+
+
 def test_guides_without_noise_come_out_as_they_went_in(rng):
     y, x = np.mgrid[:48, :48]
     guide = np.stack([(x // 7 + y // 5) % 2, np.sin(x / 3), rng.random((48, 48))], -1).astype(np.float32)
     guides = np.repeat(guide[None], 5, axis=0)
-    result = prefilter_guide(guides, np.ones((5, 48, 48), np.float32))
+    result = prefilter_window(guides, np.ones((5, 48, 48), np.float32))
     np.testing.assert_allclose(result, guide, atol=1e-3)
 
 
@@ -88,7 +91,7 @@ def test_noisy_guides_lose_their_noise_and_keep_their_edges(rng):
     clean = np.zeros((48, 48, 3), np.float32)
     clean[:, 24:] = 0.6
     guides = clean + rng.normal(0, 0.05, (5, 48, 48, 3)).astype(np.float32)
-    result = prefilter_guide(guides, np.ones((5, 48, 48), np.float32))
+    result = prefilter_window(guides, np.ones((5, 48, 48), np.float32))
     # 45 samples at best, so a seventh of the deviation; a fifth allows for weights below 1
     assert (result - clean)[:, 4:20].std() < 0.2 * 0.05
     edge = result[:, 24].mean() - result[:, 23].mean()
@@ -100,7 +103,7 @@ def test_only_tiles_whose_guides_are_noisy_are_filtered(rng):
     guides = np.repeat(clean[None], 5, axis=0)
     guides[:, 70:] += rng.normal(0, 0.05, (5, 26, 40, 3)).astype(np.float32)
     guides[2, :32] += 1e-4  # which the filter would average away
-    result = prefilter_guide(guides, np.ones((5, 96, 40), np.float32))
+    result = prefilter_window(guides, np.ones((5, 96, 40), np.float32))
     np.testing.assert_array_equal(result[:32], guides[2, :32])
     assert np.abs(result[70:] - clean[70:]).mean() < 0.5 * np.abs(guides[2, 70:] - clean[70:]).mean()
 
@@ -110,9 +113,9 @@ def test_only_rows_around_noise_are_read(rng):
     guides[:, 100:110] += rng.normal(0, 0.05, (3, 10, 24, 3)).astype(np.float32)
     guides[:, 299] += rng.normal(0, 0.05, (3, 24, 3)).astype(np.float32)
     confidence, rows = np.ones(guides.shape[:3], np.float32), []
-    result = prefilter_noisy_rows(guides[1], lambda part: rows.append(part) or guides[:, part], confidence)
+    result = prefilter_guide(guides[1], lambda part: rows.append(part) or guides[:, part], confidence)
     assert rows == [slice(64, 160), slice(256, 300)]
-    np.testing.assert_array_equal(result, prefilter_guide(guides, confidence))
+    np.testing.assert_array_equal(result, prefilter_window(guides, confidence))
     assert np.abs(result[100:110] - 0.5).mean() < 0.8 * np.abs(guides[1, 100:110] - 0.5).mean()
 
 
@@ -122,10 +125,10 @@ def test_columns_are_filtered_alike_in_parts_and_in_the_whole(rng, monkeypatch, 
     for columns in (np.s_[:64], np.s_[300:]):
         guides[:, :, columns] += rng.normal(0, 0.1, guides[:, :, columns].shape).astype(np.float32)
     confidence = np.ones(guides.shape[:3], np.float32)
-    found = prefilter_guide(guides, confidence)
+    found = prefilter_window(guides, confidence)
     monkeypatch.setattr("nlm.variance._MOST_COLUMNS", share)
     # Tiles begin elsewhere, and their running sums round otherwise.
-    np.testing.assert_allclose(prefilter_guide(guides, confidence), found, atol=1e-4)
+    np.testing.assert_allclose(prefilter_window(guides, confidence), found, atol=1e-4)
     assert np.abs(found[:, :64] - guides[1, :, :64]).max() > 0.05
     np.testing.assert_array_equal(found[:, 150:250], guides[1, :, 150:250])
 

@@ -94,7 +94,7 @@ def test_light_too_rare_for_the_pilot_to_have_measured_is_kept():
             picture[5, 5] += 0.0003 * 32 * 32
         return picture.astype(np.float32)
 
-    assert depths(needed_bounces(render, EVERYTHING, 8, 8))["cycles.diffuse_bounces"] == 2
+    assert depths(needed_bounces(render, EVERYTHING, 8))["cycles.diffuse_bounces"] == 2
 
 
 def test_every_decision_says_its_figure_threshold_and_reason():
@@ -129,7 +129,7 @@ def test_depth_is_the_least_whose_missing_light_is_below_the_stated_fraction():
     # Depth d of a diffuse path brings 0.3^d: what is missing after d is 0.3^(d+1)/0.7. The picture's mean is about
     # 1.43 (direct light 1, and the sum); the first d with 0.3^(d+1)/0.7 ≤ 0.001·1.43 is 5.
     render = Renderer({"diffuse": [0.3 ** (d + 1) for d in range(32)]})
-    found = depths(needed_bounces(render, {**EVERYTHING, "cycles.volume_bounces": 0}, 8, 8))
+    found = depths(needed_bounces(render, {**EVERYTHING, "cycles.volume_bounces": 0}, 8))
     mean = 1 + 0.3 / 0.7
     missing = [0.3 ** (d + 1) / 0.7 / mean for d in range(8)]
     assert found["cycles.diffuse_bounces"] == next(d for d, m in enumerate(missing) if m <= MEAN_FRACTION)
@@ -147,7 +147,7 @@ def test_light_that_no_mean_shows_but_the_noise_would_is_kept():
             picture[16:] -= 0.01
         return picture.astype(np.float32)
 
-    found = depths(needed_bounces(render, {**EVERYTHING}, 8, 8))
+    found = depths(needed_bounces(render, {**EVERYTHING}, 8))
     assert found["cycles.glossy_bounces"] == 3
     assert found["cycles.diffuse_bounces"] == 0
 
@@ -155,7 +155,7 @@ def test_light_that_no_mean_shows_but_the_noise_would_is_kept():
 def test_a_cleaner_picture_needs_deeper_paths():
     def needs(samples):
         render = Renderer({"diffuse": [0.0004 / 2**d for d in range(32)]}, 0.02)
-        return depths(needed_bounces(render, EVERYTHING, 8, samples))["cycles.diffuse_bounces"]
+        return depths(needed_bounces(render, EVERYTHING, samples))["cycles.diffuse_bounces"]
 
     # 0.0008 of a mean of 1 is less than the first criterion, and half of what the second allows at 8 samples (a
     # normal deviate's mean size is 0.8 σ: 0.1 · 0.8 · 0.02 = 0.0016), but 11 times what it allows at 4096.
@@ -166,17 +166,17 @@ def test_a_cleaner_picture_needs_deeper_paths():
 
 def test_scaling_the_light_changes_no_depth():
     render = Renderer({"diffuse": [0.3 ** (d + 1) for d in range(32)], "glossy": [0.1, 0.05]})
-    brighter = depths(needed_bounces(lambda s, seed: 1000 * render(s, seed), EVERYTHING, 8, 8))
-    assert brighter == depths(needed_bounces(render, EVERYTHING, 8, 8))
+    brighter = depths(needed_bounces(lambda s, seed: 1000 * render(s, seed), EVERYTHING, 8))
+    assert brighter == depths(needed_bounces(render, EVERYTHING, 8))
 
 
 def test_a_black_picture_needs_no_paths_and_divides_by_nothing():
-    found = depths(needed_bounces(lambda s, seed: np.zeros((4, 5, 3), np.float32), EVERYTHING, 8, 8))
+    found = depths(needed_bounces(lambda s, seed: np.zeros((4, 5, 3), np.float32), EVERYTHING, 8))
     assert set(found.values()) == {0}
 
 
 def test_a_pilot_stays_a_pilot():
     """Bisection: at most four pictures a kind, not one per depth."""
     render = Renderer({kind: [0.9**d for d in range(32)] for kind in ("diffuse", "glossy", "transmission", "volume")})
-    needed_bounces(render, EVERYTHING, 8, 8)
+    needed_bounces(render, EVERYTHING, 8)
     assert render.calls <= 2 + 6 * 4 + 1

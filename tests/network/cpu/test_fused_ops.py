@@ -44,9 +44,9 @@ def test_the_greatest_of_four_features(dtype: torch.dtype, channels: int) -> Non
 def test_low_bits_of_the_first_channels_are_kept() -> None:
     torch.manual_seed(0)
     x = torch.cat([torch.randn(2, 9, 5, 7), torch.full((2, 9, 1, 7), 1 + 2**-8)], 2)  # and a tie
-    wanted = fused.with_low_bits(x.requires_grad_(), 3)  # with gradients: torch
+    wanted = fused.with_low_bits(x.requires_grad_())  # with gradients: torch
     with torch.no_grad():
-        found = fused.with_low_bits(x, 3)
+        found = fused.with_low_bits(x)
     assert found.is_contiguous(memory_format=torch.channels_last)
     assert torch.equal(found, wanted)
     # The rounding errors of both halves are at most 2^-9 of what is rounded.
