@@ -75,7 +75,9 @@ def _build_paper(description: Mapping[str, Any]) -> Model:
         raise ValueError(f"expected model RobustUNet, MultiScale, RAUNet, RAResNet or TKPCN, got {name!r}")
     values = dict(description["config"])
     if "kernel" in values:
-        values["kernel"] = _configure(paper.KernelConfig, values["kernel"])
+        # Earlier versions wrote the only activation that is left.
+        kernel = {key: value for key, value in values["kernel"].items() if (key, value) != ("activation", "relu")}
+        values["kernel"] = _configure(paper.KernelConfig, kernel)
     model: Model = getattr(paper, name)(_configure(getattr(paper, f"{name}Config"), values))
     return model
 

@@ -24,37 +24,21 @@ from loops.parallel import run_bands
 _PROCESSOR = "cpu"  # where compiled loops run; elsewhere torch's own operations
 
 
-def threshold_kernel(weights: Tensor, threshold: float | Tensor | None = None, *, centre: int) -> Tensor:
-    """Thresholded, normalised kernel of raw weights (the paper's η_t, section 4): ``(N, K, H, W)``, ≥ 0, sums to 1.
-
-    ``η_t(w_i) = max(0, w_i − t) / Σ_j max(0, w_j − t)``. ``t < 1/K``, by default ``1 / (2K)``, keeps a normalised
-    kernel of equal weights alive. Where no weight exceeds it, the kernel is the identity: all weight on the tap
-    `centre`, gradient 0.
-    """
-    return _activate(weights, threshold, centre, relative=False)
-
-
 def predict_kernel(weights: Tensor, threshold: float | Tensor | None = None, *, centre: int) -> Tensor:
-    """Kernel of raw weights on any scale, ``η_t(η_0(w))``: normalised, thresholded, normalised; float32 or float64.
+    """Kernel ``(N, K, H, W)`` of raw weights on any scale, ≥ 0, sums to 1: ``η_t(η_0(w))``; float32 or float64.
+
+    ``η_t(w_i) = max(0, w_i − t) / Σ_j max(0, w_j − t)`` (the paper, section 4). ``t < 1/K``, by default ``1 / (2K)``,
+    keeps a kernel of equal weights alive. Where no weight exceeds it, the kernel is the identity: all weight on the tap
+    `centre`, gradient 0.
 
     Without the first normalisation t would be compared with numbers whose scale the network chooses, and the same t
     would mean something else in each pixel. As ``η_t(w / s) = η_{t s}(w)``, the first normalisation needs only its sum.
     Kept in float32: in half precision a weight near 1/K has lost the digits that distinguish it from t.
     """
-    return _activate(_at_least_float32(weights), threshold, centre, relative=True)
-
-
-def softmax_kernel(weights: Tensor, threshold: float | Tensor = 0.0, *, centre: int) -> Tensor:
-    """Softmax of raw weights, thresholded and normalised again where the threshold is not 0; float32 or float64.
-
-    ``η_t(σ(w))`` with ``σ(w_i) = exp(w_i) / Σ_j exp(w_j)`` (the paper's equation 2). The greatest weight of a softmax
-    is at least 1/K, so with t < 1/K it never falls back to the identity.
-    """
-    return threshold_kernel(_at_least_float32(weights).softmax(1), threshold, centre=centre)
-
-
-def _at_least_float32(weights: Tensor) -> Tensor:
-    return weights if weights.dtype == torch.float64 else weights.float()
+    weights = weights if weights.dtype == torch.float64 else weights.float()
+    threshold = 0.5 / weights.shape[1] if threshold is None else threshold
+    kernel: Tensor = _Threshold.apply(weights, threshold, centre)  # type: ignore[no-untyped-call]
+    return kernel
 
 
 def apply_kernels(kernels: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
@@ -185,19 +169,13 @@ def double(image: Tensor) -> Tensor:
     return doubled
 
 
-def _activate(weights: Tensor, threshold: float | Tensor | None, centre: int, relative: bool) -> Tensor:
-    threshold = 0.5 / weights.shape[1] if threshold is None else threshold
-    kernel: Tensor = _Threshold.apply(weights, threshold, centre, relative)  # type: ignore[no-untyped-call]
-    return kernel
-
-
 class _Threshold(torch.autograd.Function):
-    """η_t of raw weights, or, if relative, η_t of normalised weights; one buffer instead of autograd's eight."""
+    """η_t of normalised weights; one buffer instead of autograd's eight."""
 
     @staticmethod
-    def forward(ctx: Any, weights: Tensor, threshold: float | Tensor, centre: int, relative: bool) -> Tensor:
+    def forward(ctx: Any, weights: Tensor, threshold: float | Tensor, centre: int) -> Tensor:
         buffer = torch.relu(weights)
-        cut = threshold * buffer.sum(1, keepdim=True) if relative else threshold
+        cut = threshold * buffer.sum(1, keepdim=True)
         kernel = torch.sub(weights, cut, out=buffer).relu_()
         total = kernel.sum(1, keepdim=True)
         # Also a denormal, whose reciprocal is infinite.
@@ -205,7 +183,7 @@ class _Threshold(torch.autograd.Function):
         kernel.div_(total.masked_fill_(nothing, torch.inf))
         kernel[:, centre : centre + 1] += nothing  # no gradient: it is divided by the total, infinity
         ctx.save_for_backward(weights, kernel, total)
-        ctx.threshold, ctx.relative = threshold, relative
+        ctx.threshold = threshold
         return kernel
 
     @staticmethod
@@ -215,10 +193,10 @@ class _Threshold(torch.autograd.Function):
         mean = (gradient * kernel).sum(1, keepdim=True)
         above = kernel > 0
         to_weights = torch.sub(gradient, mean).div_(total).mul_(above)
-        if ctx.relative:  # the cut is t times the sum of the positive weights
-            to_cut = to_weights.sum(1, keepdim=True).mul_(ctx.threshold)
-            to_weights.sub_(to_cut * (weights > 0))
-        return to_weights, None, None, None
+        # The cut is t times the sum of the positive weights.
+        to_cut = to_weights.sum(1, keepdim=True).mul_(ctx.threshold)
+        to_weights.sub_(to_cut * (weights > 0))
+        return to_weights, None, None
 
 
 class _ApplyKernels(torch.autograd.Function):

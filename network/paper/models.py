@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from network.paper.blocks import ResidualBlock, RobustAverage, TemporalModule
 from network.paper.inputs import CHANNELS, KernelWindow, network_inputs
-from network.paper.kernels import Filtered, Pyramid, check_threshold, predict_kernel, softmax_kernel
+from network.paper.kernels import Filtered, Pyramid, check_threshold, predict_kernel
 from network.unet import channels_last, check_size
 
 
@@ -25,11 +25,8 @@ class KernelConfig:
     frames: int = 5  # T, odd; the window
     size: int = 5  # K×K taps on each frame
     threshold: float = 0.5  # t·taps: 0.5 is the paper's t = 1 / (2K)
-    activation: str = "relu"  # the paper's η_t, or "softmax"; both with the threshold, 0 for none
 
     def __post_init__(self) -> None:
-        if self.activation not in ("relu", "softmax"):
-            raise ValueError(f"activation: expected relu or softmax, got {self.activation!r}")
         _check_odd("frames", self.frames)
         _check_odd("size", self.size)
         check_threshold(self.threshold)
@@ -121,10 +118,9 @@ def _check_odd(name: str, value: int) -> None:
 class KernelHead(nn.Module):
     """Last layer: features of each frame to one kernel per pixel over all frames.
 
-    With h the output of the convolution and c the confidence of the frame over the mean of all: with relu, the paper's
-    η_t, the raw weights are ``t + (1 − tK) c / K + h / K``: as η_t takes t away and renormalises, h = 0 gives the mean
-    over time and the taps, weighted by confidence, and a tap may get any weight or none. With softmax they are
-    ``log c + h`` with h bounded to ±4: frames without confidence stay out, whatever h is.
+    With h the output of the convolution and c the confidence of the frame over the mean of all, the raw weights are
+    ``t + (1 − tK) c / K + h / K``: as the paper's η_t takes t away and renormalises, h = 0 gives the mean over time and
+    the taps, weighted by confidence, and a tap may get any weight or none.
     """
 
     def __init__(self, channels: int, config: KernelConfig) -> None:
@@ -148,9 +144,6 @@ class KernelHead(nn.Module):
         raw = self.window(features).unflatten(0, (config.frames, -1)).transpose(0, 1)
         raw = raw.to(torch.float32, memory_format=torch.contiguous_format)
         cut = config.threshold if threshold is None else check_threshold(threshold)
-        if config.activation == "softmax":
-            weights = 4.0 * torch.tanh(raw / 4.0) + confidence.log()
-            return softmax_kernel(weights.flatten(1, 2), cut / config.taps, centre=config.centre)
         # In units of 1/K, to which η_t is invariant.
         weights = config.threshold + (1 - config.threshold) * confidence + raw
         return predict_kernel(weights.flatten(1, 2), cut / config.taps, centre=config.centre)

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +45,6 @@ MODELS: dict[str, Callable[[], Model]] = {
     "resnet": lambda: RAResNet(RAResNetConfig(SMALL, width=4, blocks=2, ra_after=(1, 2), skips=1)),
     "tkpcn": lambda: TKPCN(TKPCNConfig(SMALL, width=4, blocks=1)),
     "multi-scale": lambda: MultiScale(MultiScaleConfig(make_model().config, scales=3)),
-    "softmax": lambda: RAUNet(RAUNetConfig(replace(SMALL, activation="softmax"), (4, 4), (1,))),
+    "unet": lambda: RAUNet(RAUNetConfig(SMALL, (4, 4), (1,))),
     "robust": make_robust,
 }

@@ -35,6 +35,11 @@ def test_every_model_is_built_from_its_description() -> None:
         assert again.config == model.config
 
 
+def test_the_activation_that_earlier_versions_wrote_is_the_only_one() -> None:
+    description = {"model": "RAUNet", "config": {"kernel": {"frames": 3, "activation": "relu"}}}
+    assert build(description).config.kernel.frames == 3
+
+
 @pytest.mark.parametrize(
     "description",
     [
@@ -43,6 +48,7 @@ def test_every_model_is_built_from_its_description() -> None:
         {"model": "Transformer", "config": {"kernel": {}}},
         {"model": "RAUNet", "config": {"kernel": {"frames": 5}, "depth": 3}},
         {"model": "RAUNet", "config": {"kernel": {"frames": 4}}},
+        {"model": "RAUNet", "config": {"kernel": {"activation": "softmax"}}},
     ],
 )
 def test_a_description_of_something_else_is_an_error(description: dict[str, object]) -> None:

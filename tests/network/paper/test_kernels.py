@@ -1,5 +1,4 @@
 import itertools
-import math
 
 import pytest
 import torch
@@ -11,8 +10,6 @@ from network.paper.kernels import (
     apply_kernels,
     mean_of,
     predict_kernel,
-    softmax_kernel,
-    threshold_kernel,
 )
 
 
@@ -43,47 +40,22 @@ def by_loops(kernels: torch.Tensor, frames: torch.Tensor) -> tuple[torch.Tensor,
 
 
 @pytest.mark.parametrize("t", [0.0, 0.05, 0.1])
-def test_threshold_kernel_is_the_papers_equation(t: float) -> None:
-    weights = uniform(2, 9, 3, 4) * 0.4 - 0.15
-    weights[0, :, 0, 0] = -1
-    kernel = threshold_kernel(weights, t, centre=4)
-    for n, y, x in itertools.product(range(2), range(3), range(4)):
-        expected = torch.tensor(eta(weights[n, :, y, x].tolist(), t, 4), dtype=torch.float64)
-        torch.testing.assert_close(kernel[n, :, y, x], expected)
-
-
-@pytest.mark.parametrize("t", [0.0, 0.05, 0.1])
 def test_predicted_kernel_is_normalised_thresholded_and_normalised(t: float) -> None:
     weights = uniform(1, 9, 3, 4, seed=1) * 7 - 2
     weights[0, :, 1, 1] = -3
-    expected = threshold_kernel(threshold_kernel(weights, 0, centre=4), t, centre=4)
-    torch.testing.assert_close(predict_kernel(weights, t, centre=4), expected)
-
-
-@pytest.mark.parametrize("t", [0.0, 0.05, 0.1])
-def test_softmax_kernel_is_the_papers_equation(t: float) -> None:
-    weights = uniform(1, 9, 3, 4, seed=1) * 6 - 2
-    kernel = softmax_kernel(weights, t, centre=4)
+    kernel = predict_kernel(weights, t, centre=4)
     for y, x in itertools.product(range(3), range(4)):
-        powers = [math.exp(w) for w in weights[0, :, y, x].tolist()]
-        sigma = [power / sum(powers) for power in powers]
-        torch.testing.assert_close(kernel[0, :, y, x], torch.tensor(eta(sigma, t, 4), dtype=torch.float64))
-    assert bool((kernel == 0).any()) == (t > 0)  # the plain softmax leaves no tap without weight
-
-
-def test_a_softmax_keeps_its_greatest_weight_under_every_threshold_that_is_allowed() -> None:
-    kernel = softmax_kernel(torch.zeros(1, 9, 1, 1, dtype=torch.float64), 0.111, centre=4)
-    torch.testing.assert_close(kernel, torch.full_like(kernel, 1 / 9))
+        expected = torch.tensor(eta(eta(weights[0, :, y, x].tolist(), 0, 4), t, 4), dtype=torch.float64)
+        torch.testing.assert_close(kernel[0, :, y, x], expected)
 
 
 def test_the_default_threshold_is_half_of_one_over_k() -> None:
     weights = uniform(1, 8, 2, 2)
-    for activation in (threshold_kernel, predict_kernel):
-        assert torch.equal(activation(weights, centre=0), activation(weights, 1 / 16, centre=0))
+    assert torch.equal(predict_kernel(weights, centre=0), predict_kernel(weights, 1 / 16, centre=0))
 
 
 def test_equal_weights_survive_every_threshold_that_is_allowed() -> None:
-    kernel = threshold_kernel(torch.full((1, 25, 1, 1), 1 / 25, dtype=torch.float64), 0.0399, centre=12)
+    kernel = predict_kernel(torch.full((1, 25, 1, 1), 1 / 25, dtype=torch.float64), 0.0399, centre=12)
     torch.testing.assert_close(kernel, torch.full_like(kernel, 1 / 25))
 
 
@@ -112,10 +84,9 @@ def test_kernels_are_float32_even_of_bfloat16_weights() -> None:
     torch.testing.assert_close(kernel.sum(1), torch.ones(1, 4, 4))
 
 
-@pytest.mark.parametrize("activation", [threshold_kernel, predict_kernel, softmax_kernel])
-def test_activation_gradient(activation) -> None:  # type: ignore[no-untyped-def]
+def test_activation_gradient() -> None:
     weights = (uniform(2, 9, 3, 2, seed=5) * 0.5 - 0.1).requires_grad_()
-    assert torch.autograd.gradcheck(lambda w: activation(w, 0.06, centre=4), weights)
+    assert torch.autograd.gradcheck(lambda w: predict_kernel(w, 0.06, centre=4), weights)
 
 
 def test_activation_gradient_with_a_threshold_per_sample() -> None:

@@ -335,7 +335,7 @@ def test_a_compiled_network_trains_alike(sets, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "terms"), [*((name, "temporal") for name in MODELS), ("softmax", "power"), ("softmax", "spatial")]
+    ("name", "terms"), [*((name, "temporal") for name in MODELS), ("unet", "power"), ("unet", "spatial")]
 )
 def test_every_model_learns_with_all_of_its_weights(name, terms, sets, tmp_path):
     model = MODELS[name]()
