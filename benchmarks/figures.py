@@ -39,7 +39,7 @@ from bench_shot import REPEAT, measure, write_shot
 from hybrid.files.exr import read_exr
 from hybrid.files.frame import Array
 from hybrid.files.movies import write_movie
-from hybrid.files.png import encode_bytes, measure_middle_gray, write_label, write_png
+from hybrid.files.png import display_exposure, encode_bytes, write_label, write_png
 from hybrid.files.shots import Shot
 from ravg import open_shot
 from tests.exr_files import write_layers
@@ -445,10 +445,10 @@ def fill(text: str, results: Results) -> str:
 # Pictures.
 
 
-def _beside(images: dict[str, Array], middle: float) -> Array:
-    """Labelled images side by side, each pixel as 2×2; `middle` is shown at 0.18 in linear light."""
+def _beside(images: dict[str, Array], exposure: float) -> Array:
+    """Labelled images side by side, each pixel as 2×2, over `exposure`."""
     shown = {
-        name: encode_bytes(np.repeat(np.repeat(image, 2, 0), 2, 1) * np.float32(0.18 / middle))
+        name: encode_bytes(np.repeat(np.repeat(image, 2, 0), 2, 1) * np.float32(1 / exposure))
         for name, image in images.items()
     }
     for name, image in shown.items():
@@ -460,8 +460,8 @@ def draw_motion(options: argparse.Namespace) -> None:
     """README: seven frames of *kitchen* at 8 samples as they play."""
     shot = open_shot(f"{find_shot('kitchen', options)}/s008.####.exr")
     images = {method: ladder.denoise(shot, method) for method in ("noisy", "oidn-best", "balanced")}
-    middle = measure_middle_gray(images["oidn-best"][0])
-    frames = [_beside({m: row[i] for m, row in images.items()}, middle) for i in range(len(shot.numbers))]
+    exposure = display_exposure(images["oidn-best"][0])
+    frames = [_beside({m: row[i] for m, row in images.items()}, exposure) for i in range(len(shot.numbers))]
     write_movie(IMAGES / "motion.webp", iter([*frames, *frames[-2:0:-1]]), 8.0)
 
 
@@ -481,7 +481,7 @@ def draw_flicker(options: argparse.Namespace) -> None:
             curves[1], x + flow[..., 0], y + flow[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
         )
         images[method] = np.clip(0.214 + 25 * 0.214 * (moved - curves[0]) * valid[..., None], 0, 1)
-    write_png(IMAGES / "flicker.png", _beside(images, 0.18) / 255)
+    write_png(IMAGES / "flicker.png", _beside(images, 1) / 255)
 
 
 def draw_filter(options: argparse.Namespace) -> None:
@@ -493,7 +493,7 @@ def draw_filter(options: argparse.Namespace) -> None:
         shot = truth.shot("s032")
         images = {method: ladder.denoise(shot, method)[1] for method in ("noisy", "oidn-best", "balanced")}
         images["1024 samples"] = sum(truth.references[1]) / np.float32(2)
-        write_png(IMAGES / "filter.png", _beside(images, measure_middle_gray(images["1024 samples"])) / 255)
+        write_png(IMAGES / "filter.png", _beside(images, display_exposure(images["1024 samples"])) / 255)
 
 
 PICTURES = {"motion.webp": draw_motion, "flicker.png": draw_flicker, "filter.png": draw_filter}

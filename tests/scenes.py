@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from hybrid.alignment.window import AlignedWindow
 from hybrid.denoising.plan import STAGES, Rules
-from hybrid.denoising.stabilize import DenoiseWindow
+from hybrid.denoising.stabilize import Denoised, WindowDenoiser
 from hybrid.denoising.stream import FirstPass
 from hybrid.files.shots import Shot
 from hybrid.run.pipeline import Failed, Finished, RunSettings, View, denoise_frames
@@ -87,17 +88,27 @@ def only(stages: Collection[str]) -> Rules:
     return Rules(on=frozenset(stages), off=frozenset(STAGES) - frozenset(stages))
 
 
+@dataclass
+class Function(WindowDenoiser):
+    """A denoiser that is a function of windows."""
+
+    function: Callable[[AlignedWindow], Denoised]
+    radius: int = 2
+
+    def __call__(self, aligned: AlignedWindow) -> Denoised:
+        return self.function(aligned)
+
+
 def denoise_view(
     shot: Shot,
     output: Path,
-    denoise: DenoiseWindow,
+    denoise: WindowDenoiser,
     rules: Rules,
     first_pass: FirstPass | None = None,
     *,
-    radius: int = 2,
     timings: Timings | None = None,
     **settings: Any,
 ) -> Iterator[Finished | Failed]:
     """Denoise and write the frames of one view."""
     views = [View(shot, first_pass)]
-    return denoise_frames(views, output, denoise, rules, RunSettings(**settings), radius=radius, timings=timings)
+    return denoise_frames(views, output, denoise, rules, RunSettings(**settings), timings=timings)

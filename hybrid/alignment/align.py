@@ -260,8 +260,7 @@ def align_results(
 def aligned_planes(layers: Layers) -> float:
     """Count the float32 planes of each frame of an `AlignedWindow` of these layers, with its first pass."""
     guides = 3 * (layers.albedo is not None) + 3 * (layers.normal is not None)
-    aovs = sum(len(layer.channels) for layer in layers.aovs.values()) + (layers.alpha is not None)
-    return 3 + 3 + guides + aovs + 1
+    return 3 + 3 + guides + layers.aov_channels + 1
 
 
 def measure_stillness(drift_weight: Array | None, shape: tuple[int, int]) -> Stillness:

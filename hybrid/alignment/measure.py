@@ -250,7 +250,7 @@ def _is_cut(
     flow = _search(shown[0].light, shown[1].light)
     if _changed(*shown, flow) <= CUT * _changed(*shown, None):
         return False
-    guides = _guides(earlier, later)
+    guides = [*_guides(earlier, later).values()]
     return not guides or _guide_change(earlier, later, vectors or _search(*guides[0])) > CUT
 
 
@@ -261,10 +261,10 @@ def _search(picture: Array, other: Array) -> tuple[Array, Mask]:
     return flow, np.ones(flow.shape[:2], bool)
 
 
-def _guides(frame: PreparedFrame, neighbour: PreparedFrame) -> list[tuple[Array, Array]]:
+def _guides(frame: PreparedFrame, neighbour: PreparedFrame) -> dict[str, tuple[Array, Array]]:
     """Pairs of the guides that both frames have."""
-    pairs = (frame.albedo, neighbour.albedo), (frame.normal, neighbour.normal)
-    return [(guide, other) for guide, other in pairs if guide is not None and other is not None]
+    pairs = {"albedo": (frame.albedo, neighbour.albedo), "normal": (frame.normal, neighbour.normal)}
+    return {name: (guide, other) for name, (guide, other) in pairs.items() if guide is not None and other is not None}
 
 
 def fixed_noise(frame: PreparedFrame, neighbour: PreparedFrame, *, moves: bool, same: float = SAME) -> float | None:
@@ -391,7 +391,7 @@ def noise_correlation(frame: PreparedFrame, neighbour: PreparedFrame) -> Correla
         compared &= (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
         rows, columns = rows.clip(0, height - 1), columns.clip(0, width - 1)
     compared &= neighbour.valid[rows, columns]
-    for guide, other in _guides(frame, neighbour):
+    for guide, other in _guides(frame, neighbour).values():
         compared &= np.abs(guide[block] - other[rows, columns]).max(axis=-1) < ALBEDO_SIGMA
     first, second = frame.irradiance[block], neighbour.irradiance[rows, columns]
     lit = (np.minimum(first, second) > 0).all(axis=-1) & compared
@@ -704,7 +704,7 @@ def _guide_noise(
     """Upper quartile of guide differences over every `factor`-th pixel; reduced guides would have less noise."""
     grid = slice(factor // 2, None, factor)
     differences = []
-    for guide, other in _guides(frame, neighbour):
+    for guide, other in _guides(frame, neighbour).values():
         moved = other[grid]
         if vectors is not None:
             whole = np.ascontiguousarray(other)
@@ -735,14 +735,7 @@ def _outline_noise(
 
     None without vectors or guides, and where next to nothing moves by whole pixels.
     """
-    both = {
-        name: (guide, other)
-        for name, guide, other in (
-            ("albedo", frame.albedo, neighbour.albedo),
-            ("normal", frame.normal, neighbour.normal),
-        )
-        if guide is not None and other is not None
-    }
+    both = _guides(frame, neighbour)
     if vectors is None or not both or at_whole_pixels(vectors[0][::factor, ::factor]).mean() < WHOLE_PIXELS:
         return None
     others = {f"other_{name}": other for name, (_, other) in both.items()}
@@ -816,7 +809,7 @@ def _second_differences(layer: Array) -> tuple[Array, Array]:
 def _guide_change(frame: PreparedFrame, neighbour: PreparedFrame, vectors: tuple[Array, Mask] | None = None) -> float:
     """Share of the picture whose guides differ along the vectors, in means of 9×9 pixels, by more than noise."""
     shares = [0.0]
-    for guide, other in _guides(frame, neighbour):
+    for guide, other in _guides(frame, neighbour).values():
         moved = other if vectors is None else warp(other, vectors[0])[0]
         difference = cv2.blur(guide - moved, (9, 9))
         shares.append(float(np.mean(np.square(difference).sum(axis=-1) > 3 * GUIDE_CHANGE**2)))

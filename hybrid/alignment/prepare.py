@@ -235,8 +235,7 @@ def prepared_planes(layers: Layers) -> float:
     """Count the float32 planes of a `PreparedFrame` of these layers, with its light."""
     given = (layers.albedo, layers.normal, layers.variance)
     motion = 0 if layers.motion is None else len(layers.motion.channels) + 0.5
-    one_way = layers.motion_convention is not None and not layers.motion_convention.pair
-    single = (layers.depth is not None and one_way) + (layers.alpha is not None)
+    single = (layers.depth is not None and layers.one_way) + (layers.alpha is not None)
     aovs = sum(len(layer.channels) for layer in (*layers.aovs.values(), *layers.pass_colors.values()))
     return 3 + 3 + 3 * sum(layer is not None for layer in given) + motion + single + aovs + 0.25  # validity: a byte
 

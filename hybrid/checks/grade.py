@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float32]
+from hybrid.files.frame import Array
 
 TILE = 8  # sides of the tiles whose means are compared: the mean of 64 pixels has an eighth of a pixel's noise
 

@@ -377,8 +377,7 @@ class _Report:
                 LOG.debug(f"  {'run' if decision.on else 'not run'}: {decision.stage} ({decision.reason})")
         if merged is not None:
             shots.log_noise(merged)
-        stages = {name: asdict(stage) for name, stage in timings.stages.items()}
-        LOG.debug(timings.table(self.pixels), extra={"facts": {"stages": stages}})
+        LOG.debug(timings.table(self.pixels), extra={"facts": {"stages": timings.figures()}})
 
 
 def _run(job: Job, record: Record) -> None:

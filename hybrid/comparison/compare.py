@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 from hybrid.comparison.evaluation import Evaluator, Level, mean_error, store_flows, store_reference
 from hybrid.comparison.ladder import build_ladder
 from hybrid.comparison.methods import METHODS, Method
+from hybrid.comparison.metrics import halves_of
 from hybrid.comparison.results import Comparison, Ladder, MethodResult, Statistic
 from hybrid.comparison.running import ENOUGH, WARM_UP, OnStep, RunCost, run_in_process, summarize_runs, time_methods
 from hybrid.comparison.samples import NoiseLaw
@@ -58,7 +59,7 @@ def compare_shot(
     a frame or differs in size, or levels do not fit the shot, the methods or a ladder.
     """
     options = options or CompareOptions()
-    halves = reference if isinstance(reference, tuple) else (reference,)
+    halves = halves_of(reference)
     numbers = _common_frames(shot, halves)
     _check_levels(numbers, methods, options)
     inputs = _inputs(numbers, halves, methods, options.levels)

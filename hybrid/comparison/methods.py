@@ -6,6 +6,7 @@ from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Literal
 
 from hybrid.alignment.window import AlignedWindow
+from hybrid.denoising.denoisers import open_stream
 from hybrid.denoising.first_pass import (
     NETWORKS,
     OIDN_MODE_OF_NETWORKS,
@@ -71,14 +72,7 @@ def _stream(shot: Frames, first_pass: str, denoiser: "NetworkDenoiser | None" = 
     source = named_first_pass(first_pass, mode=OIDN_MODE_OF_NETWORKS, backends=backends)
     if denoiser is None:
         return FrameStream(shot, Rules(), source.first_pass)
-    return FrameStream(
-        shot,
-        Rules(),
-        source.first_pass,
-        radius=denoiser.radius,
-        filter_guides=denoiser.filter_guides,
-        reads_guides=denoiser.reads_guides,
-    )
+    return open_stream(shot, Rules(), source.first_pass, denoiser)
 
 
 def filtered(shot: Frames, *, denoise: WindowFilter, first_pass: str = "none") -> Iterator[tuple[int, Array]]:

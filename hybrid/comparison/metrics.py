@@ -11,6 +11,7 @@ T(x) = e·x / (1 + e·x) for PSNR, SSIM and the temporal measures, on the radian
 
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from flow.warp import warp
 
+T = TypeVar("T")
 Array = NDArray[np.floating]
 Reference = Array | tuple[Array, Array]
 
@@ -142,9 +144,14 @@ def bootstrap_interval(values: Sequence[float] | Array, *, shots: Sequence[int] 
     return float(low), float(high)
 
 
+def halves_of(reference: T | tuple[T, T]) -> tuple[T, ...]:
+    """Return the halves of a reference, or the whole one alone."""
+    return reference if isinstance(reference, tuple) else (reference,)
+
+
 def check_images(image: Array, reference: Reference) -> None:
     """Raise ValueError if the shapes differ or the reference is not finite."""
-    for half in reference if isinstance(reference, tuple) else (reference,):
+    for half in halves_of(reference):
         if half.shape != image.shape or image.ndim != 3:
             raise ValueError(f"image and reference must be (H, W, C) alike: {image.shape}, {half.shape}")
         lost = half.size - int(np.isfinite(half).sum())
@@ -157,8 +164,7 @@ def _checked(image: Array, reference: Reference, scale: float = 1.0) -> tuple[ND
     check_images(image, reference)
     if not np.isfinite(image).all():
         image = np.full(image.shape, np.nan)
-    halves = reference if isinstance(reference, tuple) else (reference,)
-    x, *truths = (np.multiply(v, scale, dtype=np.float64) for v in (image, *halves))
+    x, *truths = (np.multiply(v, scale, dtype=np.float64) for v in (image, *halves_of(reference)))
     return x, truths[0], truths[-1]
 
 

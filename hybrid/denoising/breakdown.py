@@ -7,7 +7,7 @@ import numpy as np
 
 from hybrid.alignment.window import AlignedWindow
 from hybrid.files.frame import Array
-from hybrid.files.png import encode_srgb, fit, measure_middle_gray, write_png
+from hybrid.files.png import display_exposure, encode_srgb, fit, write_png
 from hybrid.files.shots import Shot, output_path
 from nlm.average import average, replace_nonfinite
 
@@ -92,7 +92,7 @@ def _sheet(shot: Shot, output: str | Path, names: Sequence[str]) -> Array:
     kinds = [[shot.own_name(f"{kind}.{name}") for name in names] for kind in ("contribution", "weight")]
     denoised = shot.reopened({number: output_path(output, shot, number)}, aovs=[*kinds[0], *kinds[1]]).read(number)
     noisy, _ = replace_nonfinite(shot.read(number).color)
-    exposure = np.float32(measure_middle_gray(noisy) / 0.18)
+    exposure = np.float32(display_exposure(noisy))
     rows = [
         [encode_srgb(image / exposure) for image in (noisy, denoised.color)],
         [encode_srgb(denoised.aovs[name] / exposure) for name in kinds[0]],

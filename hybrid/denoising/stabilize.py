@@ -6,21 +6,23 @@ The samples restore light that few samples carry and detail that looks like nois
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flow.warp import warp
 from hybrid.alignment.align import align, align_results, measure_stillness
+from hybrid.alignment.guides import GuideFilter
 from hybrid.alignment.prepare import ALPHA, PreparedFrame
 from hybrid.alignment.transfer import measure_typical_exposure
 from hybrid.alignment.unfiltered import as_gray
 from hybrid.alignment.window import AlignedWindow, Geometry, Window
 from hybrid.checks.validation import find_lost_light, find_nonfinite
+from hybrid.denoising.first_pass import Backends
 from hybrid.denoising.plan import Plan
 from hybrid.denoising.stream import FrameStream
-from hybrid.files.frame import Frame
+from hybrid.files.frame import Array, Frame
 from hybrid.runtime.allocator import return_freed_memory
 from nlm.average import average, channel_mean
 from nlm.fireflies import Highlights, add_highlights
@@ -28,7 +30,6 @@ from nlm.moving_lights import CONTENT, LEAST, confirmed_by_neighbour, find_brigh
 from nlm.parts import limit_change
 from nlm.samples import SampleMean, beside_lamps, blend_samples, limit_lamps, restore_mean
 
-Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 # By how much a pixel may change at most where results are averaged; and where samples correct a pixel that has parts,
@@ -50,7 +51,45 @@ class Denoised:
     parts: frozenset[str] = frozenset()
 
 
-DenoiseWindow = Callable[[AlignedWindow], Denoised]
+class WindowDenoiser(Protocol):
+    """A denoiser of aligned windows. Callers use nothing else, and never ask for the class."""
+
+    needs_first_pass: ClassVar[bool] = True  # whether windows must hold a first pass
+    guided: bool = True  # whether `AlignedWindow.guide` or its confidence by geometry is read where there are no AOVs
+    reads_guides: bool = True  # whether windows' guides, or samples beside first passes, are read
+    packages: ClassVar[tuple[str, ...]] = ()  # packages that pixels depend on
+
+    @property
+    def filter_guides(self) -> GuideFilter | None:
+        """Function that filters a frame's albedo and normal, for networks that need them without noise."""
+        return None
+
+    @property
+    def radius(self) -> int:
+        """Frames on each side of the centre."""
+        return 2
+
+    @property
+    def settings(self) -> Mapping[str, object]:
+        """JSON values that pixels depend on; the header of each frame holds them."""
+        return {}
+
+    @property
+    def devices(self) -> Mapping[str, str]:
+        """Library → the device that it computes on."""
+        return {}
+
+    @property
+    def backends(self) -> Backends:
+        """Functions for the first pass."""
+        return Backends()
+
+    def memory(self, shape: tuple[int, int]) -> int | None:
+        """Bytes that a network takes while it runs on frames of this height and width; None without a network."""
+        return None
+
+    def __call__(self, aligned: AlignedWindow) -> Denoised:
+        """Denoise the centre of a window."""
 
 
 class Excess(NamedTuple):
@@ -130,7 +169,7 @@ class FrameDenoiser:
     def __init__(
         self,
         stream: FrameStream,
-        denoise: DenoiseWindow,
+        denoise: WindowDenoiser,
         *,
         rows: int | None = None,
         keep_going: bool = False,
@@ -212,16 +251,15 @@ class FrameDenoiser:
         stream.keeper.trim()
         for band in bands:
             assert window is not None
-            # A denoiser may be a plain function.
-            guided = getattr(self.denoise, "guided", True)
-            aligned = [align(window, band, guided=guided, timings=stream.timings)]
+            aligned = [align(window, band, guided=self.denoise.guided, timings=stream.timings)]
             if band is bands[-1]:
                 window = None  # frees its composed flows while the denoiser runs
             stream.keeper.trim()
             outliers += aligned[0].outliers
             neighbours, inner = aligned[0].neighbours, aligned[0].inner
             # No reference stays here: a network frees what it has read before it runs.
-            denoised = self.denoise(aligned.pop())
+            # By name: a call of the object itself would hold the window until it returns.
+            denoised = self.denoise.__call__(aligned.pop())
             named: dict[tuple[str, str], NDArray[Any] | None]
             named = {("color", ""): denoised.color, ("drift", ""): neighbours.drift_weight}
             named |= {("aovs", name): layer for name, layer in denoised.aovs.items()}

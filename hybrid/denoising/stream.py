@@ -235,7 +235,7 @@ class FrameStream:
     @property
     def support(self) -> int:
         """Frames on each side of the centre that are prepared for a window."""
-        return self.radius if self.source is None else self.source.reach(self.radius)
+        return reach_of(self.source, self.radius)
 
     def _collect(
         self,
@@ -509,6 +509,11 @@ class FrameStream:
         return frame
 
 
+def reach_of(first_pass: FirstPass | None, radius: int) -> int:
+    """Count the frames on each side of the centre that a window of this radius and its first pass are made of."""
+    return radius if first_pass is None else first_pass.reach(radius)
+
+
 def kept_planes(
     shot: Shot, stages: Collection[str], first_pass: FirstPass | None, radius: int, *, filters_guides: bool = False
 ) -> float:
@@ -516,13 +521,13 @@ def kept_planes(
     layers = shot.layers(shot.numbers[0])
     guides = 1.5 * ((layers.albedo is not None) + (layers.normal is not None))  # in half precision
     filtered = guides if filters_guides and "clean-guides" in stages else 0.0
-    support = radius if first_pass is None else first_pass.reach(radius)
+    support = reach_of(first_pass, radius)
     # Fireflies are looked for in frames beyond the window, whose noise is compared with that of the next one.
     beyond = (REACH if "fireflies" in stages else 0) + ("whiten" in stages)
     frames = min(2 * support + 1 + beyond, len(shot.files))
     results = 2 if "stabilize" in stages else 1
     # With the neighbours' samples, trust, drift and excess; of a third result the color is left.
-    written = 3 + sum(len(layer.channels) for layer in layers.aovs.values()) + (layers.alpha is not None) + 10
+    written = 3 + layers.aov_channels + 10
     pictures = results * written + 4 * (results - 1)
     return frames * (prepared_planes(layers) + filtered) + _flow_planes(layers, stages, frames, radius) + pictures
 
@@ -531,7 +536,7 @@ def _flow_planes(layers: Layers, stages: Collection[str], frames: int, radius: i
     """Count the planes of flows: two of vectors, and a byte of validity, for each pair and each composed flow."""
     if "warp" not in stages:
         return 0.0
-    kept = can_refine(stages) or (layers.motion_convention is not None and not layers.motion_convention.pair)
+    kept = can_refine(stages) or layers.one_way
     steps = 2 * (frames - 1) if kept else 0  # the renderer's own are kept with the frames
     composed = 2 * (radius + 1) * max(radius - 1, 0)
     reflections = 4.0 if "reflections" in stages else 0.0  # the motion of a window, and that of its result

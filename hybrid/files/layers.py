@@ -84,6 +84,16 @@ class Layers:
     pass_colors: Mapping[str, Layer] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # layers left alone that a user might expect to be denoised; one line each
 
+    @property
+    def aov_channels(self) -> int:
+        """Number of channels of AOVs and alpha."""
+        return sum(len(layer.channels) for layer in self.aovs.values()) + (self.alpha is not None)
+
+    @property
+    def one_way(self) -> bool:
+        """Whether vectors are known to lead to one neighbour alone."""
+        return self.motion_convention is not None and not self.motion_convention.pair
+
     def without(self, roles: Collection[str]) -> Self:
         """Return the layers without some roles, and without the layers these are made from."""
         gone = {*roles}
@@ -142,7 +152,7 @@ def find_layers(
         if {*guide.channels} & {*color.channels}:
             raise ExrError(f"{image.path}: {guide} is taken for both color and {role}, expected two layers")
 
-    view = color.view or (image.views[0] if image.views else None)
+    view = _view_of(image, color)
     if len(image.views) > 1 and not isinstance(overrides.get("color"), Layer):
         notes.append(f"view {view} is denoised; {', '.join(v for v in image.views if v != view)} stays as it is")
     notes += _find_unused(image, color, {**found, "motion": found["motion"] or found["motion_next"]})
@@ -245,9 +255,19 @@ def find_colors(image: ExrImage, profile: Profile) -> list[Layer]:
     return list(dict.fromkeys(colors))
 
 
+def _view_of(image: ExrImage, color: Layer) -> str | None:
+    """The stereo view of the color."""
+    return color.view or (image.views[0] if image.views else None)
+
+
+def _visible(image: ExrImage, view: str | None) -> list[Layer]:
+    """The layers of a stereo view, and those of none."""
+    return [layer for layer in image.layers if layer.view in (None, view)]
+
+
 def _name_colors(image: ExrImage, profile: Profile, view: str | None, notes: list[str]) -> list[Layer]:
     """The layers of a view that have one of the renderer's names for the color, or else a common one."""
-    visible = [layer for layer in image.layers if layer.view in (None, view)]
+    visible = _visible(image, view)
     for names in (profile.own_names("color"), profile.names("color")):
         # Bare channels are a file's, not those of any of its parts.
         named = [x for x in visible if ({*_tails(image, x)} - {""} if without_view(x) else {""}) & {*names}]
@@ -410,7 +430,7 @@ def _only_picture(image: ExrImage, profile: Profile) -> Layer | None:
 
 def _name_grays(image: ExrImage, profile: Profile, view: str | None) -> list[Layer]:
     """The gray layers of a view that have a name for the color."""
-    visible = [layer for layer in image.layers if layer.view in (None, view)]
+    visible = _visible(image, view)
     named = [x for x in visible if ({*_tails(image, x)} - {""} or {""}) & {*profile.names("color"), *image.views}]
     grays = [gray for layer in named if (gray := _as_gray(layer))]
     return [gray for gray in grays if component_of(gray.channels[0]) in _LUMINANCE]
@@ -450,12 +470,8 @@ def _group(image: ExrImage, layer: Layer) -> str:
 def _same_group(image: ExrImage, color: Layer) -> list[Layer]:
     """The layers of the color's view layer (or of none) and of its stereo view (or of none)."""
     group = _group(image, color)
-    view = color.view or (image.views[0] if image.views else None)
-    return [
-        layer
-        for layer in image.layers
-        if layer.view in (None, view) and {p.rpartition(".")[0] for p in _paths(image, layer)} & {group, ""}
-    ]
+    visible = _visible(image, _view_of(image, color))
+    return [layer for layer in visible if {p.rpartition(".")[0] for p in _paths(image, layer)} & {group, ""}]
 
 
 def _paths(image: ExrImage, layer: Layer) -> list[str]:

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid.files.frame import Array
 from hybrid.files.replace import write_file
 
-Array = NDArray[np.float32]
 Image8 = NDArray[np.uint8]
 CELLS = 48
 
@@ -31,16 +31,16 @@ def encode_filmic(linear: NDArray[Any]) -> Array:
     return encode_srgb(1 - k / (mixed + k))  # 1 for infinity
 
 
-def measure_middle_gray(light: NDArray[Any]) -> float:
-    """Light that is shown as middle gray, 0.18: the geometric mean of the lit cells of a finite picture (H, W, C).
+def display_exposure(light: NDArray[Any]) -> float:
+    """Divisor that shows the geometric mean of the lit cells of a finite picture (H, W, C) as middle gray, 0.18.
 
     A mean is that of windows and lamps where they are in view. There are at most `CELLS` a side, as the logarithm of
-    noise is no measure of light. 1 for a picture without light.
+    noise is no measure of light. That of a picture without light counts as 1.
     """
     gray = np.maximum(light, 0).mean(axis=-1, dtype=np.float32, keepdims=True)
     cells = fit(gray, CELLS)
     lit = cells[cells > 0].astype(np.float64)
-    return float(np.exp(np.log(lit).mean())) if lit.size else 1.0
+    return float(np.exp(np.log(lit).mean()) if lit.size else 1.0) / 0.18
 
 
 # From 16 bits to 8; near black a step of 16 linear bits is a twentieth of a step of 8 sRGB bits.

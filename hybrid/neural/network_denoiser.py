@@ -10,8 +10,8 @@ import torch
 
 from hybrid.alignment.window import AlignedWindow
 from hybrid.denoising.breakdown import Breakdown, layers_of, stage_layers
-from hybrid.denoising.denoisers import WindowDenoiser
 from hybrid.denoising.first_pass import Backends
+from hybrid.denoising.stabilize import WindowDenoiser
 from hybrid.files.frame import Array
 from hybrid.neural.oidn_networks import denoise_bundled, first_pass_memory, torch_backend
 from hybrid.neural.tiling import Block, image_of, tiles

@@ -15,10 +15,10 @@ from flow.convention import choose_convention
 from flow.motion import MotionConvention
 from flow.patches import FramePair, Patches
 from hybrid.checks.pass_sums import classify_passes, sample_rows
+from hybrid.denoising.denoisers import open_stream
 from hybrid.denoising.first_pass import SPECS
 from hybrid.denoising.plan import Plan
 from hybrid.denoising.stabilize import FrameDenoiser
-from hybrid.denoising.stream import FrameStream
 from hybrid.files.frame import Array, Frame
 from hybrid.files.passes import BEAUTY, NO_PASSES
 from hybrid.files.profile import parse_motion
@@ -232,14 +232,7 @@ def denoise_arrays(
         prepare_process(chosen)
         denoiser = open_denoiser(chosen)
         source = choose_first_pass(cast("Shot", shot), chosen, denoiser)
-        stream = FrameStream(
-            shot,
-            chosen.rules,
-            source.first_pass,
-            radius=denoiser.radius,
-            filter_guides=denoiser.filter_guides,
-            reads_guides=denoiser.reads_guides,
-        )
+        stream = open_stream(shot, chosen.rules, source.first_pass, denoiser)
         denoise = FrameDenoiser(stream, denoiser, strength=chosen.strength)
         if wanted and (doubt := _doubt_vectors(shot, wanted[0])) is not None:
             warnings.warn(doubt, stacklevel=2)

@@ -5,11 +5,11 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
-from hybrid.denoising.denoisers import WindowDenoiser
+from hybrid.denoising.denoisers import open_stream
 from hybrid.denoising.first_pass import FirstPassSource, PerFrame
 from hybrid.denoising.plan import Rules
-from hybrid.denoising.stabilize import FrameDenoiser
-from hybrid.denoising.stream import FirstPass, FrameStream
+from hybrid.denoising.stabilize import FrameDenoiser, WindowDenoiser
+from hybrid.denoising.stream import FirstPass
 from hybrid.files.frame import cut_middle
 from hybrid.files.shots import Shot
 
@@ -54,15 +54,7 @@ def measure_presets(
         # A sequence holds whole frames, and only a part is measured.
         whole = source.name == "sequence"
         given: FirstPass | None = PerFrame(lambda frame: frame.color) if whole else source.first_pass
-        stream = FrameStream(
-            part,
-            rules,
-            given,
-            radius=denoiser.radius,
-            filter_guides=denoiser.filter_guides,
-            reads_guides=denoiser.reads_guides,
-        )
-        frames, spent = FrameDenoiser(stream, denoiser), []
+        frames, spent = FrameDenoiser(open_stream(part, rules, given, denoiser), denoiser), []
         for number in numbers:
             start = time.perf_counter()
             frames.make(number)

@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple, Self, get_args, get_origin, get_type_hin
 
 from hybrid.checks.validation import ValidationReport, find_cut, validate_layers
 from hybrid.denoising.breakdown import Breakdown, write_breakdown
-from hybrid.denoising.denoisers import AverageDenoiser, ClassicalDenoiser, WindowDenoiser
+from hybrid.denoising.denoisers import AverageDenoiser, ClassicalDenoiser
 from hybrid.denoising.first_pass import (
     NETWORKS,
     OIDN_MODE_OF_NETWORKS,
@@ -29,6 +29,7 @@ from hybrid.denoising.first_pass import (
 )
 from hybrid.denoising.plan import NEURAL_STAGES, Rules
 from hybrid.denoising.pseudo_reference import CLASSICAL_PRESETS, FINAL
+from hybrid.denoising.stabilize import WindowDenoiser
 from hybrid.denoising.stream import plan_shot
 from hybrid.files.passes import BEAUTY
 from hybrid.files.replace import check_outputs, temporary_folder
@@ -547,7 +548,6 @@ class Job:
                     self.denoiser if last or self.breakdown is None else open_denoiser(options, self.timings),
                     options.rules,
                     replace(settings, resume=options.resume and last, keep_going=options.keep_going and last),
-                    radius=self.denoiser.radius,
                     strength=options.strength,
                     timings=self.timings,
                 )

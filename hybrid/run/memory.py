@@ -131,6 +131,6 @@ def _worked_planes(layers: Layers, frames: int, filtered: bool) -> tuple[float, 
     if filtered:
         return 2.0 * frames * aligned_planes(layers) + WORKING, 0.0
     # A network reads the first pass, confidences and AOVs alone.
-    aovs = sum(len(layer.channels) for layer in layers.aovs.values()) + (layers.alpha is not None)
+    aovs = layers.aov_channels
     # While it is aligned, also the confidence by geometry and the weights of drift.
     return frames * (4 + 2.0 * aovs) + BESIDE_NETWORK, frames * (6 + 2.0 * aovs) + BESIDE_NETWORK

@@ -12,9 +12,10 @@ from typing import NamedTuple
 
 from hybrid.alignment.fireflies import REACH
 from hybrid.checks.validation import find_nonfinite
+from hybrid.denoising.denoisers import open_stream
 from hybrid.denoising.plan import Plan, Rules
-from hybrid.denoising.stabilize import DenoiseWindow, FrameDenoiser, FrameResult
-from hybrid.denoising.stream import FirstPass, FrameStream
+from hybrid.denoising.stabilize import FrameDenoiser, FrameResult, WindowDenoiser
+from hybrid.denoising.stream import FirstPass, reach_of
 from hybrid.files.prefetch import Prefetcher
 from hybrid.files.replace import remove_leftovers
 from hybrid.files.shots import Shot, output_path
@@ -80,11 +81,10 @@ class RunSettings:
 def denoise_frames(
     views: Sequence[View],
     output: str | Path,
-    denoise: DenoiseWindow,
+    denoise: WindowDenoiser,
     rules: Rules,
     settings: RunSettings = RunSettings(),
     *,
-    radius: int = 2,
     strength: float = 1.0,
     timings: Timings | None = None,
 ) -> Iterator[Finished | Failed]:
@@ -107,7 +107,7 @@ def denoise_frames(
     with ExitStack() as threads:
         reader = threads.enter_context(ThreadPoolExecutor(1, "read"))
         writer = _Writer(threads.enter_context(ThreadPoolExecutor(1, "write")), settings.keep_going, timings)
-        frames = _ShotDenoiser(views, denoise, rules, settings, radius, strength, reader, timings)
+        frames = _ShotDenoiser(views, denoise, rules, settings, strength, reader, timings)
         following = dict(pairwise(shot.numbers))
         for number, path in paths.items():
             result: Finished | Failed | Callable[[], Finished]
@@ -159,34 +159,24 @@ class _ShotDenoiser:
     def __init__(
         self,
         views: Sequence[View],
-        denoise: DenoiseWindow,
+        denoise: WindowDenoiser,
         rules: Rules,
         settings: RunSettings,
-        radius: int,
         strength: float,
         thread: ThreadPoolExecutor,
         timings: Timings,
     ) -> None:
         self.views, self.settings, self.timings = views, settings, timings
         self.shot = views[0].shot
-        self.support = temporal_support(views[0].first_pass, radius, rules)
+        self.support = temporal_support(views[0].first_pass, denoise.radius, rules)
         self.ahead = self.support - REACH - ("whiten" in rules.allowed)
         self.lost: dict[int, Exception] = {}  # frames that could not be read, which count as missing
-        self.sources = sources_of(views, radius, rules, settings.sources, self.lost)
+        self.sources = sources_of(views, denoise.radius, rules, settings.sources, self.lost)
         keeper = Keeper(in_files=settings.memory.in_files)
 
         def follow(view: View) -> tuple[Prefetcher, FrameDenoiser]:
             reader = Prefetcher(view.shot, thread, timings, self.lost)
-            stream = FrameStream(
-                reader,
-                rules,
-                view.first_pass,
-                radius=radius,
-                filter_guides=getattr(denoise, "filter_guides", None),  # a denoiser may be a plain function
-                reads_guides=getattr(denoise, "reads_guides", True),
-                timings=timings,
-                keeper=keeper,
-            )
+            stream = open_stream(reader, rules, view.first_pass, denoise, timings=timings, keeper=keeper)
             going = settings.keep_going
             rows = settings.memory.rows
             return reader, FrameDenoiser(stream, denoise, rows=rows, keep_going=going, strength=strength)
@@ -301,7 +291,7 @@ def temporal_support(first_pass: FirstPass | None, radius: int, rules: Rules) ->
     Those of its window, two for fireflies, one to average results, and one whose noise is compared.
     """
     more = ("stabilize" in rules.allowed) + ("whiten" in rules.allowed)
-    return REACH + more + (radius if first_pass is None else first_pass.reach(radius))
+    return REACH + more + reach_of(first_pass, radius)
 
 
 def sources_of(

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from hybrid.files.movies import check_movie, write_movie
-from hybrid.files.png import Image8, encode_bytes, measure_middle_gray, write_label, write_png
+from hybrid.files.png import Image8, display_exposure, encode_bytes, write_label, write_png
 from hybrid.files.shots import Shot, output_path
 from nlm.average import replace_nonfinite
 
@@ -34,7 +34,7 @@ def check_png(path: Path, what: str) -> None:
 def write_preview(shot: Shot, output: str | Path, path: Path, *, rate: float = 24.0) -> None:
     """Write the middle frame as a .png, noisy left and denoised right, or a .mp4 or .webp with a moving divider.
 
-    Movies play at `rate` frames per second. All frames have one exposure, by `measure_middle_gray` of the middle noisy
+    Movies play at `rate` frames per second. All frames have one exposure, by `display_exposure` of the middle noisy
     frame, and are sRGB encoded.
     """
     check_preview(path)
@@ -85,7 +85,7 @@ class _Pairs:
         self.noisy = shot
         self.denoised = shot.reopened({number: output_path(output, shot, number) for number in shot.numbers})
         middle, _ = replace_nonfinite(shot.reader.read_color(shot.numbers[len(shot.numbers) // 2]))
-        self._exposure = np.float32(measure_middle_gray(middle) / 0.18)
+        self._exposure = np.float32(display_exposure(middle))
 
     def read(self, number: int) -> tuple[Image8, Image8]:
         return self._encoded(self.noisy, number), self._encoded(self.denoised, number)

@@ -11,7 +11,7 @@ import platform
 import re
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +79,7 @@ class Record:
             "state": state,
             "updated": now,
             "seconds": round(now - self._start, 3),
-            "stages": {name: asdict(stage) for name, stage in timings.stages.items()},
+            "stages": timings.figures(),
             "peak_bytes": peak_memory(),
         }
         if not self._written:

@@ -4,7 +4,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 from hybrid.runtime.system import peak_memory, thread_clock
 
@@ -55,6 +55,10 @@ class Timings:
                 spent = time.thread_time() - start
                 self._ended += spent
             self._add(name, 0.0, spent, calls=0)
+
+    def figures(self) -> dict[str, dict[str, float]]:
+        """Return the fields of each stage, by its name."""
+        return {name: asdict(stage) for name, stage in self.stages.items()}
 
     def _cpu_time(self) -> float:
         """CPU seconds of the process without background work."""

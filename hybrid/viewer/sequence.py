@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from hybrid.files.decode import Window, data_window, display_size, place
 from hybrid.files.exr import MAX_PIXELS, ExrError, ExrImage, Layer, component_of, read_exr
 from hybrid.files.layers import Layers, find_colors, find_layers
-from hybrid.files.png import Image8, encode_filmic, encode_srgb, measure_middle_gray
+from hybrid.files.png import Image8, display_exposure, encode_filmic, encode_srgb
 from hybrid.files.profile import find_profile
 from hybrid.files.sequences import Pattern, find_files, list_patterns, parse_frames, pattern_of
 from hybrid.files.sources import MADE_FROM, parse_object
@@ -109,7 +109,7 @@ class Sequence:
         """Return the divisor that brings middle gray of a frame's color to 0.18."""
         image = read_exr(self._path(number))
         color, _ = replace_nonfinite(image.pixels(_layers(image).color.channels))
-        return float(measure_middle_gray(color) / 0.18)
+        return display_exposure(color)
 
     def picture(self, number: int, name: str, gain: float, ev: float, view: str = "srgb") -> Image8:
         """Return a layer of a frame as an (H, W, 3) 8-bit image on the display window, black outside the data.

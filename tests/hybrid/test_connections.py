@@ -26,7 +26,7 @@ from hybrid.run import budget, job
 from hybrid.run.memory import MemoryPlan, plan_memory
 from hybrid.run.pipeline import View, denoise_frames
 from hybrid.run.records import read_records
-from tests.scenes import Scene
+from tests.scenes import Function, Scene
 
 ROOT = Path(__file__).parents[2]
 
@@ -193,7 +193,7 @@ def test_nothing_that_is_not_finite_is_written_of_any_view(tmp_path, where):
     views = [View(view) for view in open_shot(Scene(noise=0.1).write(tmp_path / "in", edit=edit)).views]
     assert len(views) == 2
     with pytest.raises(ValueError, match="it was not written"):
-        list(denoise_frames(views, tmp_path / "out", denoise, Rules(off=frozenset({"stabilize"}))))
+        list(denoise_frames(views, tmp_path / "out", Function(denoise), Rules(off=frozenset({"stabilize"}))))
     assert not list((tmp_path / "out").glob("*.exr"))
 
 
@@ -261,7 +261,7 @@ def test_the_header_has_the_stages_of_the_first_view_and_the_neighbours_of_all(t
 
     monkeypatch.setattr("hybrid.run.pipeline.FrameDenoiser", Fake)
     views = open_shot(Scene(frames=2).write(tmp_path / "in", edit=edit)).views
-    assert len(list(denoise_frames([View(view) for view in views], tmp_path / "out", Denoised, Rules()))) == 2
+    assert len(list(denoise_frames([View(view) for view in views], tmp_path / "out", Function(Denoised), Rules()))) == 2
     header = read_exr(tmp_path / "out" / "shot.1001.exr").parts[0].header
     assert header["ravg/stages"] == "gate"
     assert header["ravg/beside"] == ""
@@ -276,7 +276,7 @@ def test_the_outliers_of_all_bands_are_counted(shot_folder, monkeypatch):
     def denoise(aligned):
         return Denoised(aligned.color[aligned.middle] * aligned.modulation)
 
-    denoiser = FrameDenoiser(stream, denoise, rows=20)
+    denoiser = FrameDenoiser(stream, Function(denoise), rows=20)
     assert denoiser.make(1002).outliers == 3 * Scene.height // 20
 
 

@@ -10,7 +10,7 @@ from hybrid.denoising.first_pass import PerFrame
 from hybrid.denoising.plan import Rules
 from hybrid.denoising.stabilize import Denoised
 from hybrid.files.shots import Shot, open_shot
-from tests.scenes import Scene, denoise_view
+from tests.scenes import Function, Scene, denoise_view
 
 FRAMES, RADIUS = 10, 2
 # Neighbours one and two frames away that all windows have together; the flow to one two frames away, and its flow back,
@@ -80,6 +80,6 @@ def test_each_stage_runs_once(tmp_path, count):
     shot = open_shot(Scene(frames=FRAMES, noise=0.1).write(tmp_path / "in"))
     first_pass = PerFrame(counted("first pass", lambda frame: frame.color.copy()), turns=True)
     denoise = counted("denoise", lambda aligned: Denoised(aligned.first_pass[RADIUS] * aligned.modulation))
-    for _ in denoise_view(shot, tmp_path / "out", denoise, Rules(), first_pass, radius=RADIUS):
+    for _ in denoise_view(shot, tmp_path / "out", Function(denoise, RADIUS), Rules(), first_pass):
         pass
     assert dict(counts) == EXPECTED

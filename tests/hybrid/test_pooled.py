@@ -14,7 +14,7 @@ from hybrid.denoising.pseudo_reference import SECOND_LOOK, gated_average, pool_a
 from hybrid.denoising.stabilize import Denoised, FrameDenoiser
 from hybrid.denoising.stream import FrameStream
 from hybrid.files.shots import open_shot
-from tests.scenes import Scene, only
+from tests.scenes import Function, Scene, only
 
 STAGES = {"demodulate", "warp", "gate"}
 SCENE = Scene(frames=5, height=48, width=64)
@@ -139,7 +139,7 @@ class TestWithOidn:
         parts = [
             FrameDenoiser(
                 FrameStream(shot, only(STAGES), radius=1, first_pass=find_first_pass("oidn-fast", shot).first_pass),
-                lambda aligned: Denoised(pool_and_denoise(aligned)),
+                Function(lambda aligned: Denoised(pool_and_denoise(aligned))),
                 rows=rows,
             )
             .make(1002)

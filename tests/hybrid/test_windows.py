@@ -16,7 +16,7 @@ from hybrid.denoising.stream import FrameStream, plan_shot
 from hybrid.files.exr import read_exr
 from hybrid.files.shots import open_shot
 from hybrid.run.records import read_records
-from tests.scenes import Scene, denoise_view
+from tests.scenes import Function, Scene, denoise_view
 from tests.seldom import seldom
 
 # Locked off: what is odd is odd by itself. Frame numbers 1001 to 1012; the odd one is 1009.
@@ -108,7 +108,7 @@ def test_a_frame_is_the_same_whatever_part_of_the_shot_is_asked_for(tmp_path, ch
         shot = open_shot(folder, frames=frames)
         estimates = PerFrame(lambda frame: frame.color)
         for _ in denoise_view(
-            shot, tmp_path / name, lambda w: Denoised(gated_average(w)), Rules(), first_pass=estimates
+            shot, tmp_path / name, Function(lambda w: Denoised(gated_average(w))), Rules(), first_pass=estimates
         ):
             pass
 
@@ -140,7 +140,7 @@ def test_a_lamp_that_estimates_have_lost_has_its_light_once(tmp_path, step):
     def run(name, edit, rules):
         shot = open_shot(scene.write(tmp_path / name, edit=edit))
         out = tmp_path / f"{name}_out"
-        for _ in denoise_view(shot, out, lambda w: Denoised(gated_average(w)), rules, first_pass=blind):
+        for _ in denoise_view(shot, out, Function(lambda w: Denoised(gated_average(w))), rules, first_pass=blind):
             pass
         return read_exr(out / "shot.1003.exr").pixels(("ViewLayer.Combined.R",))[..., 0]
 

@@ -20,7 +20,7 @@ from hybrid.files.exr import HALF_MAX, read_exr
 from hybrid.files.frame import Frame
 from hybrid.files.shots import open_shot
 from tests.exr_files import write_layers
-from tests.scenes import Scene
+from tests.scenes import Function, Scene
 
 SIZE = (40, 56)
 COMMANDS = [["denoise", "--preset", "draft"], ["denoise", "--preset", "balanced"]]
@@ -224,7 +224,7 @@ class TestRegion:
         blur = PerFrame(lambda frame: cv2.blur(frame.color, (7, 7)))
         maker = FrameDenoiser(
             FrameStream(shot, Rules(off=frozenset({"restore-mean", "blend-samples"})), first_pass=blur),
-            lambda aligned: Denoised(gated_average(aligned)),
+            Function(lambda aligned: Denoised(gated_average(aligned))),
         )
         color = maker.make(scene.first + 1).denoised.color
         truth = scene.clean(1)["ViewLayer.Combined"]
@@ -257,7 +257,8 @@ def test_black_stays_black_where_nothing_is(tmp_path, told_by):
 
     shot = open_shot(scene.write(tmp_path, edit=cut_out))
     blur = PerFrame(lambda frame: cv2.blur(frame.color, (5, 5)))
-    maker = FrameDenoiser(FrameStream(shot, Rules(), first_pass=blur), lambda aligned: Denoised(gated_average(aligned)))
+    stream = FrameStream(shot, Rules(), first_pass=blur)
+    maker = FrameDenoiser(stream, Function(lambda aligned: Denoised(gated_average(aligned))))
     color = maker.make(scene.first + 1).denoised.color
     assert not color[~disk].any()
     assert (color[disk] > 0).all()

@@ -12,7 +12,7 @@ from hybrid.comparison.methods import METHODS
 from hybrid.comparison.metrics import psnr
 from hybrid.denoising.plan import Rules
 from hybrid.denoising.pseudo_reference import filter_window
-from hybrid.denoising.stabilize import Denoised
+from hybrid.denoising.stabilize import Denoised, WindowDenoiser
 from hybrid.denoising.stream import FrameStream
 from hybrid.files.shots import Shot, open_shot
 from hybrid.files.sources import MADE_FROM
@@ -81,9 +81,9 @@ def test_a_network_gets_its_guides_filtered_as_in_a_run(shot: Shot, monkeypatch:
     """Without them `quality` of a comparison was 1.1 dB below that of `ravg denoise` at 8 samples."""
     guided = []
 
-    class Denoiser:
+    class Denoiser(WindowDenoiser):
         radius = 1
-        filter_guides, reads_guides = staticmethod(dict), True
+        filter_guides = staticmethod(dict)
 
         def __call__(self, aligned: AlignedWindow) -> Denoised:
             guided.append(aligned.centre.filtered_guides is not None)

@@ -22,7 +22,7 @@ from hybrid.files.shots import open_shot
 from hybrid.files.sources import MADE_FROM
 from hybrid.run.pipeline import BESIDE
 from hybrid.run.records import read_records
-from tests.scenes import Scene, denoise_view, only
+from tests.scenes import Function, Scene, denoise_view, only
 
 MOVING = Scene(frames=7, noise=0.1)
 STILL = replace(MOVING, step=(0, 0))
@@ -54,7 +54,7 @@ def nearly(scene, scale=1.0):
 
 
 def pictures(shot, denoise, rules=None, first_pass=ESTIMATES, **options):
-    return FrameDenoiser(FrameStream(shot, rules or STEADY, first_pass=first_pass), denoise, **options)
+    return FrameDenoiser(FrameStream(shot, rules or STEADY, first_pass=first_pass), Function(denoise), **options)
 
 
 def aligned_results(maker, number, colors):
@@ -388,7 +388,7 @@ class TestInFiles:
 
     @staticmethod
     def run(shot, out, denoise, rules=None, **options):
-        return list(denoise_view(shot, out, denoise, rules or STEADY, radius=1, **options))
+        return list(denoise_view(shot, out, Function(denoise, 1), rules or STEADY, **options))
 
     def test_a_frame_depends_on_the_windows_beside_it(self, tmp_path):
         shot = open_shot(MOVING.write(tmp_path / "in"), frames=str(MIDDLE))
@@ -607,7 +607,8 @@ def test_the_result_is_as_the_filter_of_the_renderer_makes_it(tmp_path, scale):
     # The denoiser knows the truth without a filter.
     rules = Rules(off=frozenset({"restore-mean", "blend-samples", "stabilize", "fireflies"}))
     frames = FrameDenoiser(
-        FrameStream(shot, rules, first_pass=ESTIMATES), lambda aligned: Denoised(truth(scene, aligned.number, scale))
+        FrameStream(shot, rules, first_pass=ESTIMATES),
+        Function(lambda aligned: Denoised(truth(scene, aligned.number, scale))),
     )
     color = frames.make(number).denoised.color
     expected = spread(truth(scene, number, scale))

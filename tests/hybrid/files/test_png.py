@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hybrid.files.png import encode_bytes, encode_filmic, encode_srgb, measure_middle_gray, write_png
+from hybrid.files.png import display_exposure, encode_bytes, encode_filmic, encode_srgb, write_png
 
 
 def test_a_png_holds_the_srgb_values_in_their_order(tmp_path):
@@ -31,16 +31,16 @@ def test_middle_gray_is_that_of_the_room_and_not_of_its_window():
     lit = room.copy()
     lit[:24, :48] = 40  # 32 times the mean of the room, on 6 % of it
     assert lit.mean() > 10 * room.mean()
-    assert measure_middle_gray(room) == pytest.approx(0.2)
-    assert measure_middle_gray(lit) < 0.3
-    assert measure_middle_gray(1e3 * lit) == pytest.approx(1e3 * measure_middle_gray(lit), rel=1e-5)
+    assert display_exposure(room) == pytest.approx(0.2 / 0.18)
+    assert display_exposure(lit) < 0.3 / 0.18
+    assert display_exposure(1e3 * lit) == pytest.approx(1e3 * display_exposure(lit), rel=1e-5)
 
 
 def test_middle_gray_is_not_that_of_noise():
     dark, lights = np.zeros((192, 384, 3), np.float32), np.random.default_rng(1).random((192, 384)) < 0.25
     dark[lights] = 0.8  # single samples of a light of 0.2
-    assert measure_middle_gray(dark) == pytest.approx(0.2, rel=0.05)
-    assert measure_middle_gray(np.zeros_like(dark)) == 1
+    assert display_exposure(dark) == pytest.approx(0.2 / 0.18, rel=0.05)
+    assert display_exposure(np.zeros_like(dark)) == 1 / 0.18
 
 
 def test_filmic_keeps_middle_gray_the_order_of_light_and_highlights():

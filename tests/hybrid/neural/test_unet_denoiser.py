@@ -10,7 +10,7 @@ from hybrid.alignment.window import WarpSources
 from hybrid.denoising.first_pass import Classical, PerFrame
 from hybrid.denoising.plan import Rules
 from hybrid.denoising.pseudo_reference import DRAFT, gated_average
-from hybrid.denoising.stabilize import Denoised, FrameDenoiser
+from hybrid.denoising.stabilize import Denoised, FrameDenoiser, WindowDenoiser
 from hybrid.denoising.stream import FrameStream
 from hybrid.files.shots import open_shot
 from hybrid.neural import open_network, unet_denoiser
@@ -60,7 +60,7 @@ def test_a_shot_of_few_samples_is_denoised_with_filtered_guides(tmp_path):
     """From the denoiser to the network: the pipeline gives its stream the filter."""
     asked = []
 
-    class Denoiser:
+    class Denoiser(WindowDenoiser):
         def filter_guides(self, guides):
             asked.append(guides)
             return guides
@@ -80,7 +80,7 @@ def test_an_average_has_no_noisy_guides_filtered_but_for_aovs(tmp_path):
     """From the denoiser to the plan: `fast` took 1.08 times the CPU time for an albedo that cancels in its average."""
     for reads, aovs, expected in ((False, (), False), (False, ("ViewLayer.Env",), True), (True, (), True)):
 
-        class Denoiser:
+        class Denoiser(WindowDenoiser):
             reads_guides, filtered = reads, expected
 
             def __call__(self, aligned):

@@ -7,7 +7,7 @@ import pytest
 from hybrid import cli
 from hybrid.denoising.first_pass import find_first_pass
 from hybrid.denoising.plan import Rules
-from hybrid.denoising.stabilize import Denoised
+from hybrid.denoising.stabilize import Denoised, WindowDenoiser
 from hybrid.files.frame import cut_middle
 from hybrid.files.shots import open_shot
 from hybrid.run import budget, job
@@ -40,10 +40,10 @@ def test_a_part_is_cut_out_of_the_middle(tmp_path):
     np.testing.assert_array_equal(cut_middle(shot, 99).read(SCENE.first).color, whole.color)
 
 
-class Fake:
+class Fake(WindowDenoiser):
     """A denoiser that calls a function with each window."""
 
-    radius, filter_guides, reads_guides = 1, None, True
+    radius = 1
 
     def __init__(self, function):
         self.function = function

@@ -12,7 +12,7 @@ from hybrid.denoising.plan import Rules
 from hybrid.denoising.stabilize import Denoised, FrameDenoiser
 from hybrid.denoising.stream import FrameStream, kept_planes
 from hybrid.files.shots import open_shot
-from tests.scenes import Scene
+from tests.scenes import Function, Scene
 
 # Few bright samples, as in most frames; large beside the small figures that are held too.
 SCENE = Scene(height=96, width=128, frames=9, noise=0.1)
@@ -60,7 +60,7 @@ def test_no_more_is_held_than_memory_is_planned_for(tmp_path, filters_guides):
 
     rules = Rules(on=frozenset({"clean-guides"}))
     filter_guides = {"filter_guides": dict} if filters_guides else {}
-    maker = FrameDenoiser(FrameStream(shot, rules, FIRST_PASS, **filter_guides), denoise)
+    maker = FrameDenoiser(FrameStream(shot, rules, FIRST_PASS, **filter_guides), Function(denoise))
     for number in range(MIDDLE - 1, MIDDLE + 2):
         maker.make(number)
     declared = kept_planes(shot, Rules().allowed, FIRST_PASS, 2, filters_guides=filters_guides)
@@ -85,7 +85,8 @@ def test_what_cleans_guides_is_kept_for_those_who_read_them(tmp_path, guided):
 
 def test_of_an_excess_only_bright_pixels_are_kept(tmp_path):
     maker = FrameDenoiser(
-        FrameStream(shot_of(tmp_path), Rules(), FIRST_PASS), lambda aligned: Denoised(aligned.centre.first_pass)
+        FrameStream(shot_of(tmp_path), Rules(), FIRST_PASS),
+        Function(lambda aligned: Denoised(aligned.centre.first_pass)),
     )
     maker.make(MIDDLE)
     result = maker._results[MIDDLE]

@@ -12,7 +12,7 @@ from hybrid.run import pipeline
 from hybrid.run.memory import MemoryPlan
 from hybrid.run.pipeline import Finished
 from hybrid.runtime.timing import Timings
-from tests.scenes import Scene, denoise_view
+from tests.scenes import Function, Scene, denoise_view
 
 SCENE = Scene(frames=4, noise=0.1)
 FIRST = SCENE.first
@@ -49,7 +49,7 @@ def test_a_frame_is_written_while_the_next_one_is_made(tmp_path, shot, monkeypat
 
     monkeypatch.setattr(Shot, "write", write_late)
     timings = Timings()
-    made = list(denoise_view(shot, tmp_path / "out", make, ALONE, timings=timings))
+    made = list(denoise_view(shot, tmp_path / "out", Function(make), ALONE, timings=timings))
     assert outcomes(made) == [("Finished", number) for number in shot.numbers]
     assert all(frame.path.is_file() and frame.seconds > 0 for frame in made)
     assert threading.main_thread() not in threads
@@ -71,7 +71,7 @@ def test_without_it_a_frame_is_there_before_the_next_one_is_begun(tmp_path, shot
         begun.append(aligned.number)
         return picture(aligned)
 
-    for frame in denoise_view(shot, tmp_path / "out", make, ALONE, radius=1, memory=MemoryPlan(background=False)):
+    for frame in denoise_view(shot, tmp_path / "out", Function(make, 1), ALONE, memory=MemoryPlan(background=False)):
         assert frame.path.is_file()
         assert begun[-1] == frame.number
         # Its window, and perhaps one beyond for what shines in a frame alone.
@@ -100,7 +100,7 @@ def test_the_next_frame_is_read_once_one_is_denoised_and_no_sooner(tmp_path, sho
 
     monkeypatch.setattr(Shot, "read", told)
     monkeypatch.setattr(pipeline, "find_nonfinite", check_late)
-    assert len(list(denoise_view(shot, tmp_path / "out", make, ALONE, radius=1))) == 4
+    assert len(list(denoise_view(shot, tmp_path / "out", Function(make, 1), ALONE))) == 4
 
 
 def fail_to_write(monkeypatch, bad):
@@ -116,7 +116,7 @@ def fail_to_write(monkeypatch, bad):
 
 def test_a_frame_that_cannot_be_written_ends_the_run_and_those_before_it_are_there(tmp_path, shot, monkeypatch):
     fail_to_write(monkeypatch, FIRST + 1)
-    frames = denoise_view(shot, tmp_path / "out", picture, ALONE)
+    frames = denoise_view(shot, tmp_path / "out", Function(picture), ALONE)
     assert next(frames).number == FIRST
     with pytest.raises(OSError, match="no space"):
         next(frames)
@@ -131,7 +131,7 @@ def test_all_others_are_made_in_order_with_keep_going(tmp_path, shot, monkeypatc
             raise ValueError("no picture")
         return picture(aligned)
 
-    frames = list(denoise_view(shot, tmp_path / "out", make, ALONE, keep_going=True))
+    frames = list(denoise_view(shot, tmp_path / "out", Function(make), ALONE, keep_going=True))
     assert outcomes(frames) == list(zip(("Finished", "Failed", "Failed", "Finished"), shot.numbers, strict=True))
     assert "no space" in str(frames[1].error)
     assert "no picture" in str(frames[2].error)
@@ -144,7 +144,7 @@ def test_the_frame_before_the_one_that_ends_the_run_is_told_first(tmp_path, shot
             raise error
         return picture(aligned)
 
-    frames = denoise_view(shot, tmp_path / "out", make, ALONE)
+    frames = denoise_view(shot, tmp_path / "out", Function(make), ALONE)
     told = [next(frames), next(frames)]
     with pytest.raises(type(error)):
         next(frames)
@@ -153,23 +153,21 @@ def test_the_frame_before_the_one_that_ends_the_run_is_told_first(tmp_path, shot
 
 
 def test_whoever_stops_listening_finds_whole_frames(tmp_path, shot):
-    frames = denoise_view(shot, tmp_path / "out", picture, ALONE)
+    frames = denoise_view(shot, tmp_path / "out", Function(picture), ALONE)
     next(frames)
     frames.close()
     there = sorted((tmp_path / "out").iterdir())
     assert [path.name for path in there] == [shot.path(number).name for number in (FIRST, FIRST + 1)]
-    for frame in denoise_view(shot, tmp_path / "out", picture, ALONE, resume=True):
+    for frame in denoise_view(shot, tmp_path / "out", Function(picture), ALONE, resume=True):
         assert isinstance(frame, Finished)
         assert frame.resumed == (frame.number <= FIRST + 1)
 
 
 def test_it_makes_no_difference_to_the_pictures(tmp_path, shot):
     for name, beside in (("one", True), ("other", False)):
-        list(denoise_view(shot, tmp_path / name, picture, ALONE, memory=MemoryPlan(background=beside)))
+        list(denoise_view(shot, tmp_path / name, Function(picture), ALONE, memory=MemoryPlan(background=beside)))
     for path in sorted((tmp_path / "one").iterdir()):
         assert path.read_bytes() == (tmp_path / "other" / path.name).read_bytes()
     wider = replace(SCENE, frames=6).write(tmp_path / "wider")
-    assert (
-        len(list(denoise_view(open_shot(wider, frames=f"{FIRST}-{FIRST + 4}x2"), tmp_path / "steps", picture, ALONE)))
-        == 3
-    )
+    steps = open_shot(wider, frames=f"{FIRST}-{FIRST + 4}x2")
+    assert len(list(denoise_view(steps, tmp_path / "steps", Function(picture), ALONE))) == 3
