@@ -11,7 +11,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from hybrid.commands.log import LOG, end_log, one_line, start_log, tolerant_streams
 from hybrid.run.option_texts import TEXTS
-from hybrid.runtime.interrupt import INTERRUPTED, is_interrupt, stop_with_stdin
+from hybrid.runtime.interrupt import INTERRUPTED, is_interrupt, stop_with_stdin, terminable
 from hybrid.runtime.system import expand_home
 from hybrid.runtime.threads import check_thread_counts, prepare_libraries
 
@@ -120,7 +120,8 @@ def _run(argv: Sequence[str] | None) -> int:
         stop_with_stdin()
         check_thread_counts()
         # Patterns are for ravg itself: on Windows typer would put the names of files in their place.
-        app(args=expand_home(sys.argv[1:] if argv is None else argv), prog_name="ravg", windows_expand_args=False)
+        with terminable():
+            app(args=expand_home(sys.argv[1:] if argv is None else argv), prog_name="ravg", windows_expand_args=False)
     except SystemExit as stop:  # typer's way to return a code; it has shown usage errors itself
         return stop.code if isinstance(stop.code, int) else 0
     except (KeyboardInterrupt, SystemError) as error:

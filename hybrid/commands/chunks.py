@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import typer
 
 from hybrid.commands.log import LOG, Progress, summarize
-from hybrid.runtime.interrupt import INTERRUPTED, interruptible
+from hybrid.runtime.interrupt import INTERRUPTED, STOP_WITH_STDIN, interruptible
 
 # Parameters that concern the submitting process alone.
 NOT_PASSED_ON = ("scheduler", "chunk", "log_format", "log_file", "quiet", "verbose", "preview", "contact_sheet", "fps")
@@ -151,17 +151,18 @@ def run_command(
 ) -> str:
     """Run a command of ravg in a process until it ends or is `stopped`; return its error, or "".
 
-    It has this process's environment and these variables too. `add` is called with each record of its log.
+    It has this process's environment and these variables too, and ends with this process. `add` is called with each
+    record of its log.
     """
     inherited = {key: value for key, value in os.environ.items() if key not in ("RAVG_SCHEDULER", "RAVG_LOG_FILE")}
-    search = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "PYTHONUTF8": "1"}
+    search = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "PYTHONUTF8": "1", STOP_WITH_STDIN: "1"}
     command = list(arguments)
     command.insert(command.index("--"), "--log-format=json")
     process = subprocess.Popen(
         [sys.executable, "-m", "hybrid.cli", *command],
         cwd=folder,
         env={**inherited, **search, **environment},
-        stdin=subprocess.DEVNULL,
+        stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
@@ -178,15 +179,16 @@ def run_command(
 
     threading.Thread(target=watch, daemon=True).start()
     last = ""
-    for line in process.stderr or ():
-        try:
-            record = json.loads(line)
-            level = record["level"]
-        except (ValueError, TypeError, KeyError):  # of a library, or a traceback
-            last = line.strip() or last
-            continue
-        if level == "error":
-            last = record["message"]
-        add(record)
-    code = process.wait()
+    with process:
+        for line in process.stderr or ():
+            try:
+                record = json.loads(line)
+                level = record["level"]
+            except (ValueError, TypeError, KeyError):  # of a library, or a traceback
+                last = line.strip() or last
+                continue
+            if level == "error":
+                last = record["message"]
+            add(record)
+    code = process.returncode
     return "" if code == 0 else f"ended with {code}: {last}"

@@ -359,8 +359,8 @@ class _Report:
         if frame.fireflies:
             LOG.debug(f"{name}: {frame.fireflies} fireflies removed, {share:.2%} of its light")
         if frame.repaired:
-            lost = f"{frame.repaired} pixels were not finite or beyond 1e14"
-            LOG.warning(f"{name}: {lost}, filled in from neighbours; check the render")
+            lost = f"{name}: {frame.repaired} pixels were not finite or beyond 1e14, filled in from neighbours"
+            LOG.warning(f"{lost}; check the render")
         if frame.clamped:
             LOG.warning(f"{name}: {frame.clamped} values too large for half, written as 65504; 32-bit input keeps them")
 

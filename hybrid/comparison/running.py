@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import active_children
 from typing import NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
@@ -46,7 +47,12 @@ def run_in_process(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) 
     """Call a module-level function in a fresh process with a peak memory of its own; BrokenProcessPool if it dies."""
     let_waiting_threads_sleep()  # libraries read the setting when the new process first uses them
     with ProcessPoolExecutor(1, mp_context=start_context(__name__), initializer=reuse_freed_memory) as pool:
-        return pool.submit(function, *args, **kwargs).result()
+        try:
+            return pool.submit(function, *args, **kwargs).result()
+        except KeyboardInterrupt:
+            for process in active_children():  # the pool would wait for its work
+                process.terminate()
+            raise
 
 
 class _TimedFrames:

@@ -10,14 +10,14 @@ import torch
 
 from hybrid.alignment.transfer import measure_exposure
 from hybrid.alignment.window import AlignedWindow
-from hybrid.denoising.first_pass import OIDN_MODES, find_first_pass
+from hybrid.denoising.first_pass import OIDN_MODES, Backends, find_first_pass
 from hybrid.denoising.plan import Rules
 from hybrid.denoising.pseudo_reference import gated_average, pool_and_denoise
 from hybrid.denoising.stream import FrameStream
 from hybrid.files.frame import Array
 from hybrid.files.shots import Shot
 from hybrid.neural.network_denoiser import exposure_of
-from hybrid.neural.oidn_networks import has_oidn_networks, prefilter_guides
+from hybrid.neural.oidn_networks import denoise_bundled, has_oidn_networks, prefilter_guides
 from hybrid.neural.tiling import image_of, tensor_of
 from hybrid.neural.unet_denoiser import clean_guides, gain_of
 from network.training.clips import Clip, importance, important_places, write_shards
@@ -79,7 +79,8 @@ def write_clips(
         raise ValueError(f"teacher: expected references beside it, got none of {source.name}")
     shots, numbers = list(source.levels.values()), source.numbers()
     rendered = [*shots, *([] if source.target is None else [source.target])]
-    first_passes = [find_first_pass(estimate, shot) for shot in rendered]
+    backends = Backends(bundled=denoise_bundled)
+    first_passes = [find_first_pass(estimate, shot, backends=backends) for shot in rendered]
     filter_guides = prefilter_guides if has_oidn_networks() else None
     streams = [
         FrameStream(

@@ -46,6 +46,21 @@ def is_interrupt(error: BaseException | None) -> bool:
 
 
 @contextmanager
+def terminable() -> Iterator[None]:
+    """Treat SIGTERM, and Ctrl-Break, as Ctrl-C."""
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
+        yield
+        return
+    numbers = [number for number in INTERRUPTS if number != signal.SIGINT]
+    before = {number: signal.signal(number, signal.default_int_handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
 def interruptible(report: Callable[[], None]) -> Iterator[None]:
     """Let Ctrl-C, SIGTERM, or Ctrl-Break end the process within about a second.
 

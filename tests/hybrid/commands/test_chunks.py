@@ -1,8 +1,11 @@
 import os
 import re
 import signal
+import subprocess
+import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
@@ -12,6 +15,7 @@ from hybrid.commands.chunks import Chunk, run_jobs
 from loops import parallel
 from tests.scenes import Scene
 
+ROOT = Path(__file__).parents[3]
 FRAMES = 5
 OPTIONS = ["--preset", "draft"]
 
@@ -82,6 +86,39 @@ def test_the_process_has_the_variables_and_hands_on_its_log(monkeypatch):
     fault = chunks.run_command(["denoise", "--", "shot"], lambda: False, records.append, environment={"THREADS": "4"})
     assert fault == "ended with 3: 4"
     assert records == [{"level": "warning", "message": "odd"}]
+
+
+PARENT = """
+import sys
+from hybrid.commands import chunks
+popen = chunks.subprocess.Popen
+chunks.subprocess.Popen = lambda _, **options: popen([sys.executable, "-c", *sys.argv[1:]], **options)
+chunks.run_command(["denoise", "--", "shot"], lambda: False, lambda record: None)
+"""
+CHILD = """
+import pathlib, sys, time
+from hybrid.runtime.interrupt import stop_with_stdin
+stop_with_stdin()
+try:
+    pathlib.Path(sys.argv[1], "begun").touch()
+    for _ in range(600):
+        time.sleep(0.1)
+except KeyboardInterrupt:
+    pathlib.Path(sys.argv[1], "ended").touch()
+"""
+
+
+def test_a_chunk_ends_with_the_process_that_started_it(tmp_path):
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
+    parent = subprocess.Popen([sys.executable, "-c", PARENT, CHILD, str(tmp_path)], env=environment)
+    for name, end in (("begun", lambda: None), ("ended", parent.kill)):
+        end()
+        for _ in range(600):
+            if (tmp_path / name).exists():
+                break
+            time.sleep(0.05)
+        assert (tmp_path / name).exists()
+    parent.wait()
 
 
 def with_damaged_frame(shot, folder):

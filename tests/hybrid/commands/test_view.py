@@ -22,7 +22,8 @@ ROOT = Path(__file__).parents[3]
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT for other processes")
 @pytest.mark.usefixtures("interrupts")
-def test_it_serves_until_ctrl_c(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_it_serves_until_ctrl_c_or_sigterm(tmp_path, number):
     """The result may be empty: it is watched while it is being made."""
     noisy = Scene().write(tmp_path / "noisy")
     words = ["view", str(tmp_path / "out"), "--beside", str(noisy), "--no-browser"]
@@ -35,7 +36,7 @@ def test_it_serves_until_ctrl_c(tmp_path):
         assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{20,}/", url)
         with urllib.request.urlopen(url + "state", timeout=30) as answer:
             assert b'"1003"' in answer.read()
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         assert process.wait(timeout=30) == 0
     finally:
         process.kill()

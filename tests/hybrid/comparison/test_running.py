@@ -1,18 +1,21 @@
 """Methods run apart: what they cost is their own, and none is dropped in silence."""
 
 import os
+import signal
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
 
 from hybrid.comparison import running
 from hybrid.comparison.methods import METHODS, Method
-from hybrid.comparison.running import RunCost, Seconds, run_method, summarize_runs, time_methods
+from hybrid.comparison.running import RunCost, Seconds, run_in_process, run_method, summarize_runs, time_methods
 from hybrid.comparison.store import FrameStore
 from hybrid.denoising.oidn import denoise_oidn
 from hybrid.files.frame import Frame
@@ -156,3 +159,25 @@ class TestOidn:
         quality = "balanced" if "balanced" in name else "high"
         expected = denoise_oidn(frame.color, frame.albedo, frame.normal, quality=quality, prefilter=prefilter)
         np.testing.assert_array_equal(store.load(name, 7), expected)
+
+
+def work(folder: Path) -> None:
+    (folder / "begun").touch()
+    time.sleep(5)
+    (folder / "ended").touch()
+
+
+@pytest.mark.posix
+@pytest.mark.usefixtures("interrupts")
+def test_ctrl_c_does_not_wait_for_the_work_of_a_process(tmp_path: Path) -> None:
+    def interrupt() -> None:
+        while not (tmp_path / "begun").exists():
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = Thread(target=interrupt)
+    thread.start()
+    with pytest.raises(KeyboardInterrupt):
+        run_in_process(work, tmp_path)
+    thread.join()
+    assert not (tmp_path / "ended").exists()

@@ -100,6 +100,11 @@ def test_the_pseudo_reference_is_the_gated_average_and_no_noisy_frame(middle):
     assert np.median(np.abs(image - truth) / truth) < 0.5 * np.median(np.abs(noisy - truth) / truth)
 
 
+def test_the_bundled_network_makes_first_passes(dim, tmp_path):
+    shot = open_shot(tmp_path / "dim", frames=str(MIDDLE))
+    assert write_clips(ClipSource("dim", {"noisy": shot}, [4]), tmp_path, tile=0, estimate="bundled")
+
+
 def test_beside_estimates_by_oidn_the_pseudo_reference_is_gathered(dim, tmp_path, monkeypatch):
     found: list[Clip] = []
     monkeypatch.setattr(module, "write_shards", lambda folder, name, samples, clips: found.extend(clips) or [])
