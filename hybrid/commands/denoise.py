@@ -304,7 +304,7 @@ def _finish(
     if job is not None:
         _print_weights(job)
     if failed:
-        LOG.error(f"{len(failed)} frames could not be made: {format_frames(sorted(failed))}")
+        LOG.error(f"frames not made: {format_frames(sorted(failed))}")
         raise typer.Exit(1)
 
 
