@@ -19,6 +19,7 @@ import re
 import subprocess
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from functools import partial
@@ -181,7 +182,9 @@ def find_scene(scene: str, options: argparse.Namespace) -> str:
 def find_shot(name: str, options: argparse.Namespace) -> Path:
     """The folder of a shot: seven frames of each level, and references of three; rendered unless all are there."""
     folder: Path = options.work / "shots" / name
-    if len(list(folder.glob("reference_b.*.exr"))) >= 3 and len(list(folder.glob("s*.exr"))) % 7 == 0:
+    counts = Counter(path.name.partition(".")[0] for path in folder.glob("*.exr"))
+    levels = [count for name, count in counts.items() if name.startswith("s")]
+    if counts["reference_b"] >= 3 and set(levels) == {7}:
         return folder
     if name in OTHERS:
         _, renderer, *words = OTHERS[name]

@@ -333,15 +333,14 @@ def restore_mean(picture: Floats, noisy: Floats, exposure: float) -> Floats:
         s = max(0, 1 − k (1 + (f / N)²) v / D²),    v = K[d²] / n,    N = n K[d²]² / K[d⁴],
 
     D is K d, moved towards 0 by up to the mean light that the limit cut off: without its brightest samples a mean is
-    too dark.
-    All in the mean over channels, n the pixels of K: the shrinkage of James and Stein. N counts the samples that make
-    the noise: five fireflies determine neither a mean nor its variance. The weight u keeps the light of all pixels
-    but those much brighter than their surroundings, which count by their relative error: a lamp that is too bright
-    darkens nothing around it. The means over σ = 48 pixels come first (k = 1, f = 800), then those over 12 (7, 300),
-    and then those over 48 (4, 1000) of pixels of similar light: K is then over each of 4 bins of six stops, a = 0,
-    and a pixel counts in the two bins next to it. Last, with K the mean of the whole picture and
-    u one over the mean, the picture becomes (1 + s D w / K(w u l)) picture, w = u l / (u l + 1), s = max(0, 1 − v / D²
-    − (60 / N)²): right in the relative light, a picture of too little contrast is too dark where it is bright.
+    too dark. All in the mean over channels, n the pixels of K: the shrinkage of James and Stein. N counts the samples
+    that make the noise: five fireflies determine neither a mean nor its variance. The weight u keeps the light of all
+    pixels but those much brighter than their surroundings, which count by their relative error: a lamp that is too
+    bright darkens nothing around it. The means over σ = 48 pixels come first (k = 1, f = 800), then those over 12 (7,
+    300), and then those over 48 (4, 1000) of pixels of similar light: K is then over each of 4 bins of six stops, a =
+    0, and a pixel counts in the two bins next to it. Last, with K the mean of the whole picture and u one over the
+    mean, the picture becomes (1 + s D w / K(w u l)) picture, w = u l / (u l + 1), s = max(0, 1 − v / D² − (60 / N)²):
+    right in the relative light, a picture of too little contrast is too dark where it is bright.
     """
     picture, noisy = (np.ascontiguousarray(image, np.float32) for image in (picture, noisy))
     for sigma, certain, few, bins in _MEANS:
