@@ -193,7 +193,8 @@ class _Trials:
 
     def worth(self, reading: MotionConvention, share: float) -> bool:
         """Whether a convention explains this share of what an estimated flow does."""
-        return self.left(None) - self.left(reading) >= share * (self.left(None) - self.search())
+        explained, all_that_is = self.left(None) - self.left(reading), self.left(None)
+        return explained >= share * all_that_is or explained >= share * (all_that_is - self.search())
 
     def read(self, assumed: MotionConvention, settled: frozenset[str], typed: frozenset[str]) -> MotionConvention:
         """The best convention with the settled parts, or one that overrules those settled parts that are not typed."""

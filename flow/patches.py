@@ -6,6 +6,7 @@ from functools import cached_property
 
 import cv2
 import numpy as np
+from numba import njit
 
 from flow.guide import estimate_noise, median_luminance, tone_map
 from flow.motion import ABSURD_LENGTH, MotionConvention, decode_motion
@@ -182,44 +183,49 @@ class Patches:
         shown: tuple[np.ndarray, ...] | None = None,
     ) -> np.ndarray:
         """Costs of the patches `at`: centre and neighbour are the frames of these indices, `order`."""
-        pictures = tuple(self.pictures[index] for index in order)
-        lit = tuple((shown or self.shown)[index] for index in order)
-        difference = _compare(pictures, lit, flow * unit, self.rows[at], self.columns[at])
+        centre, other = (self.pictures[index] for index in order)
+        own_lit, other_lit = ((shown or self.shown)[index] for index in order)
+        difference = np.empty(len(at), np.float32)
+        _compare(centre, other, own_lit, other_lit, flow, unit, self.rows[at], self.columns[at], difference)
         return np.asarray(np.minimum(np.square(difference / self.scale[at]), 1))
 
 
+@njit(nogil=True, cache=True)
 def _compare(
-    pictures: tuple[np.ndarray, ...], shown: tuple[np.ndarray, ...], flow: np.ndarray, rows: np.ndarray,
-    columns: np.ndarray,
-) -> np.ndarray:  # fmt: skip
+    centre: np.ndarray, other: np.ndarray, own_lit: np.ndarray, other_lit: np.ndarray, flow: np.ndarray,
+    unit: np.ndarray, rows: np.ndarray, columns: np.ndarray, out: np.ndarray,
+) -> None:  # fmt: skip
     """Mean of other(x + v) − centre(x) over the lit part of patches; NaN where half of it leaves.
 
     Times the root of the lit share, as the mean of fewer pixels has more noise.
     """
-    size, (height, width), reach = flow.shape[1], pictures[1].shape, np.arange(flow.shape[1]) - flow.shape[1] // 2
-    centre, other, own_lit, other_lit = (layer.ravel() for layer in (*pictures, *shown))
-    y, x = rows[:, None, None] + reach[:, None], columns[:, None, None] + reach
-    here, ends = y * width + x, flow.reshape(len(rows), size, size, 2)
-    lit = own_lit[here]
-    known, pixels, parts = lit.copy(), [], []
-    for place, axis, last in ((y, 1, np.float32(height - 1)), (x, 0, np.float32(width - 1))):
-        end = place.astype(np.float32) + ends[..., axis]
-        known &= (end >= -0.5) & (end <= last + np.float32(0.5))  # NaN compares false
-        end = np.fmin(np.fmax(end, 0), last)
-        first = end.astype(np.intp)
-        parts.append(end - first.astype(np.float32))
-        pixels.append(first)
-    (y0, x0), (fy, fx) = pixels, parts
-    first, across, down = y0 * width + x0, fx > 0, (fy > 0) * width
-    last_pixel = first + down + across
-    known &= other_lit[first] & other_lit[last_pixel]
-    above = other[first] + fx * (other[first + across] - other[first])
-    below = other[first + down] + fx * (other[last_pixel] - other[first + down])
-    found = above + fy * (below - above) - centre[here]
-    total = np.where(known, found, np.float32(0)).reshape(len(rows), -1).sum(axis=1)
-    count, most = (np.count_nonzero(mask.reshape(len(rows), -1), axis=1) for mask in (known, lit))
-    enough = (count > 0) & (2 * count >= most)
-    return np.where(enough, total / (np.sqrt(np.maximum(count, 1)) * size), np.nan).astype(np.float32)
+    size, half, zero = flow.shape[1], np.float32(0.5), np.float32(0)
+    last_row, last_column = np.float32(other.shape[0] - 1), np.float32(other.shape[1] - 1)
+    for patch in range(len(rows)):
+        total, count, most = zero, 0, 0
+        for i in range(size):
+            y = rows[patch] + i - size // 2
+            for j in range(size):
+                x = columns[patch] + j - size // 2
+                if not own_lit[y, x]:
+                    continue
+                most += 1
+                v = flow[patch * size + i, j]
+                row, column = np.float32(y) + v[1] * unit[1], np.float32(x) + v[0] * unit[0]
+                # NaN compares false.
+                if not (-half <= row <= last_row + half and -half <= column <= last_column + half):
+                    continue
+                row, column = min(max(row, zero), last_row), min(max(column, zero), last_column)
+                y0, x0 = int(row), int(column)
+                fy, fx = row - np.float32(y0), column - np.float32(x0)
+                y1, x1 = y0 + (fy > zero), x0 + (fx > zero)
+                if other_lit[y0, x0] and other_lit[y1, x1]:
+                    above = other[y0, x0] + fx * (other[y0, x1] - other[y0, x0])
+                    below = other[y1, x0] + fx * (other[y1, x1] - other[y1, x0])
+                    total += above + fy * (below - above) - centre[y, x]
+                    count += 1
+        enough = count > 0 and 2 * count >= most
+        out[patch] = total / np.float32(np.sqrt(count) * size) if enough else np.nan
 
 
 def _lit_box(lit: np.ndarray) -> tuple[slice, slice]:

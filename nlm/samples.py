@@ -5,6 +5,7 @@ of a window show where, as samples of one frame are independent of those of anot
 """
 
 from collections.abc import Iterable, Sequence
+from functools import reduce
 from typing import NamedTuple, Self
 
 import cv2
@@ -308,7 +309,7 @@ def limit_lamps(picture: Floats, samples: Sequence[Floats], exposure: float) -> 
     lamp = (light > _LAMP * exposure) & np.isfinite(light)  # what is not finite is refused, and not mended
     if not lamp.any():
         return picture
-    brightest = cv2.dilate(np.maximum.reduce(samples), np.ones((5, 5), np.uint8))
+    brightest = cv2.dilate(reduce(np.maximum, samples), np.ones((5, 5), np.uint8))
     limited = np.minimum(picture, np.maximum(brightest, np.float32(_LAMP * exposure)))
     return np.where(lamp[..., None], limited, picture)
 

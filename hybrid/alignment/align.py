@@ -143,9 +143,13 @@ def _align_denoised(
             filtered_guides = average_guides(window.filtered_guides, sources.flows, aligned.confidence, rows)
     estimates, interpolation = _warp_first_pass(window, first_pass, coverage, rows, timings)
     along_surfaces = None
-    if window.reflections is not None and "blend-samples" in stages and not moves_over_noise(stages):
-        surfaces = replace(window, reflections=None)
-        along_surfaces, _ = _warp_first_pass(surfaces, first_pass, coverage, rows, timings, weigh=False)
+    if window.reflecting is not None and "blend-samples" in stages and not moves_over_noise(stages):
+        along_surfaces = estimates.copy()
+        if (found := np.flatnonzero(window.reflecting[rows].any(axis=1))).size:
+            part = slice(int(found[0]), int(found[-1]) + 1)
+            those, surfaces = slice(rows.start + part.start, rows.start + part.stop), replace(window, reflections=None)
+            given = surfaces, first_pass, coverage[:, part], those, timings
+            along_surfaces[:, part] = _warp_first_pass(*given, weigh=False)[0]
         along_surfaces /= aligned.modulation
     with timings.stage("confidence"):
         pictures, complete = [estimates, *aligned.aovs.values()], aligned.confidence[middle].all()
@@ -203,9 +207,9 @@ def _average_samples(
         # Noise that frames share would pass for detail: 6 to 12 dB of a slow pan.
         return SampleMean.unknown(estimates.shape[1:])
     sources, counted = aligned.sources, confidence
-    if along_surfaces is not None and window.reflections is not None:
+    if along_surfaces is not None and window.reflecting is not None:
         estimates, sources = along_surfaces, replace(sources, light_flows=sources.flows)
-        counted = confidence * ~window.reflections[rows].any(axis=-1)  # elsewhere the gate compared other pixels
+        counted = confidence * ~window.reflecting[rows]  # elsewhere the gate compared other pixels
     noisy = window.centre.radiance[rows]
     return average_neighbours(
         estimates, sources.residual_strips(), counted, aligned.confidence, aligned.modulation, noisy
@@ -413,10 +417,10 @@ def _warp_first_pass(
             if noise is not None and link.forward.vectors.any():
                 bilinear, _ = warp(picture, flow, first_row=rows.start)
                 weights[index] = interpolation_weight(warped[index], bilinear, noise)
-            if noise is not None and window.reflections is not None:
+            if noise is not None and window.reflecting is not None:
                 # Motion that was found may be wrong where vectors are right, as at outlines.
                 error_weight = interpolation_weight(warped[index], middle[rows], noise)
-                error_weight[~window.reflections[rows].any(axis=-1)] = 1
+                error_weight[~window.reflecting[rows]] = 1
                 known = weights[index]
                 weights[index] = error_weight if known is None else known * error_weight
             fill_uncovered(warped[index], middle[rows], coverage[index])

@@ -10,6 +10,7 @@ from hybrid.alignment.measure import (
     MOVED_NOISE,
     NEAR,
     SAME,
+    Grain,
     equal_noise,
     measure_fade,
     noise_free_around,
@@ -115,7 +116,7 @@ def _find_highlights(
     still = np.zeros_like(centre.points)
     moved = {-1: still, 1: still}
     last: dict[int, PreparedFrame | None] = {-1: frame, 1: frame}
-    compared, equal = [(frame.sampled, still)], SAME
+    compared, equal = [(Grain(frame.sampled), still)], SAME
     for distance, side in product(range(1, REACH + 1), (-1, 1)):
         nearer, undecided = last[side], witnesses.undecided
         if nearer is None or not (distance == 1 or undecided.any()):
@@ -130,14 +131,15 @@ def _find_highlights(
             if (fade != 1).any():
                 other, equal = scaled(other, fade), NEAR
             lights = _lights_of(other, follow_motion(centre, motion), centre, fade)
-            fresh = _has_own_noise(frame, places, other.sampled, lights, motion, compared, equal, held)
+            grain = Grain(other.sampled)
+            fresh = _has_own_noise(frame, places, grain, lights, motion, compared, equal, held)
             if distance == 1:
                 alone &= ~(fresh & recurs_nearby(places, frame.irradiance, lights.pixels, other.irradiance))
             tested = fresh & undecided
             same = tested & same_highlight(centre, motion, lights)
             same[same] = without_strangers(centre[same], frame.irradiance, lights.pixels[same], other.irradiance)
         witnesses.add(lights, motion, tested, same)
-        compared.append((other.sampled, motion))
+        compared.append((grain, motion))
     lasting = witnesses.lasting
     return average_highlights(centre, witnesses.found)[lasting], alone & ~lasting
 
@@ -154,14 +156,14 @@ def _lights_of(frame: PreparedFrame, pixels: Places, centre: Highlights, fade: A
 def _has_own_noise(
     frame: PreparedFrame,
     places: Places,
-    other: Array,
+    other: Grain,
     lights: Highlights,
     motion: Points,
-    compared: Sequence[tuple[Array, Points]],
+    compared: Sequence[tuple[Grain, Points]],
     equal: float,
     held: bool,
 ) -> Mask:
-    """Return which places (K,) another frame `other` shows with samples that no frame of `compared` has.
+    """Return which places (K,) another frame, `other`, shows with samples that no frame of `compared` has.
 
     `compared` are those of others with the motion there; samples are the same up to a share `equal` of their value.
     If noise is `held` at equal pixels, it is the same wherever motion is slow: the paths of one seed are alike though
@@ -170,7 +172,7 @@ def _has_own_noise(
     inside = np.isfinite(lights.light).all(axis=1)
     repeated = np.zeros(len(places), bool)
     for earlier, before in compared:
-        repeated |= repeats(earlier, other, equal)
+        repeated |= repeats(earlier.samples, other.samples, equal)
         unmoved = np.abs(motion - before).max(axis=1) < MOVED_NOISE
         if unmoved.any():
             repeated |= unmoved & (held or same_noise_at(*equal_noise(earlier, other, equal), lights.pixels))

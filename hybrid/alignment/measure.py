@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
 from typing import Self
 
 import cv2
@@ -93,6 +95,8 @@ EXPLAINED = 2.0
 #: Correlation of the noise along x and along y, each at 1 to 4 pixels.
 Correlation = tuple[tuple[float, ...], tuple[float, ...]]
 Fade = tuple[float, float, float]
+# Rows and columns of an area of an image.
+Cell = tuple[slice, slice]
 NO_FADE: Fade = (1.0, 1.0, 1.0)
 
 
@@ -448,17 +452,33 @@ def _equal_share(a: Array, b: Array, compared: Mask, same: float) -> float:
     return float((equal - (near - equal) / (2 if same == SAME else 1)) / distance.size)
 
 
-def equal_noise(frame: Array, other: Array, same: float = SAME) -> tuple[Array, Array]:
-    """Find pixels at which two frames (H, W, 3) have noise or detail, and those at which it is the same sample.
+@dataclass(frozen=True)
+class Grain:
+    """The samples of a frame (H, W, 3), and their deviation from those around them."""
+
+    samples: Array
+
+    @cached_property
+    def level(self) -> Array:
+        """Mean (H, W) over channels."""
+        return channel_mean(self.samples)
+
+    @cached_property
+    def deviation(self) -> Array:
+        """Absolute difference (H, W) of the level from the median of 5×5 pixels."""
+        return np.asarray(np.abs(self.level - cv2.medianBlur(self.level, 5)))
+
+
+def equal_noise(frame: Grain, other: Grain, same: float = SAME) -> tuple[Array, Array]:
+    """Find pixels at which two frames have noise or detail, and those at which it is the same sample.
 
     The first (H, W) is 1 where both differ from the median of 5×5 pixels by more than 2^-8 of their value, and are not
     both black, as pixels of few samples are by chance; else 0. The second is 1 where they are also equal, as half
     floats; in a fade that is up to `NEAR`, as both are rounded.
     """
-    a, b = channel_mean(frame), channel_mean(other)
+    a, b = frame.level, other.level
     most = np.maximum(np.abs(a), np.abs(b))
-    grain = np.minimum(*(np.abs(image - cv2.medianBlur(image, 5)) for image in (a, b)))
-    grainy = (grain > GRAIN * most) & (most > 0)
+    grainy = (np.minimum(frame.deviation, other.deviation) > GRAIN * most) & (most > 0)
     return grainy.astype(np.float32), (grainy & (np.abs(a - b) <= same * most)).astype(np.float32)
 
 
@@ -468,7 +488,7 @@ def repeats(frame: Array, other: Array, same: float = SAME) -> bool:
     for top in range(0, height, STRIP):
         # With the two rows on each side that a median of 5×5 pixels reads.
         first, last = max(top - 2, 0), min(top + STRIP, height)
-        detail, alike = equal_noise(frame[first : last + 2], other[first : last + 2], same)
+        detail, alike = equal_noise(Grain(frame[first : last + 2]), Grain(other[first : last + 2]), same)
         grainy += int(np.count_nonzero(detail[top - first : last - first]))
         equal += int(np.count_nonzero(alike[top - first : last - first]))
         if grainy - equal > (1 - REPEATED) * size:  # too many already
@@ -573,15 +593,17 @@ def _factors(first: Array, second: Array, compared: Mask, noise: Array | None = 
     return np.broadcast_to(np.exp(factors) if explained else np.ones(1), first.shape[2])
 
 
-def _lit_cells(lit: Mask) -> list[tuple[Places, ...]]:
+def _lit_cells(lit: Mask) -> list[Cell]:
     """Divide the lit part of an image into areas; return the indices of those with any lit pixel."""
-    rows, columns = (np.arange(*np.flatnonzero(lit.any(axis=axis))[[0, -1]] + (0, 1)) for axis in (1, 0))
-    cells = [np.ix_(y, x) for y in np.array_split(rows, AREAS[0]) for x in np.array_split(columns, AREAS[1])]
-    return [cell for cell in cells if lit[cell].any()]
+    bands = []
+    for axis, count in zip((1, 0), AREAS, strict=True):
+        places = np.array_split(np.arange(*np.flatnonzero(lit.any(axis=axis))[[0, -1]] + (0, 1)), count)
+        bands.append([slice(part[0], part[-1] + 1) for part in places if part.size])
+    return [cell for cell in product(*bands) if lit[cell].any()]
 
 
 def _choose_factors(
-    first: Array, second: Array, mean: Array, lit: Mask, cells: Sequence[tuple[Places, ...]]
+    first: Array, second: Array, mean: Array, lit: Mask, cells: Sequence[Cell]
 ) -> tuple[Doubles, Doubles]:
     """Logarithms of changes in N areas, (N, 1) or (N, 3), and of one factor for all channels, or of one for each."""
     gray = _changes(mean, channel_mean(second), lit, cells)
@@ -594,7 +616,7 @@ def _choose_factors(
     return gray[:, None], factor
 
 
-def _median_error(noise: Array, light: Array, lit: Mask, cells: Sequence[tuple[Places, ...]]) -> float:
+def _median_error(noise: Array, light: Array, lit: Mask, cells: Sequence[Cell]) -> float:
     """Median over areas of the standard error of a change by noise (H, W, C) of this light."""
     relative = np.abs(noise) / np.maximum(light, np.float32(NO_LIGHT))
     squares = np.square(np.minimum(relative, RESIDUAL_LIMIT)).mean(axis=2)
@@ -613,7 +635,7 @@ def _is_tinted(first: Array, second: Array, lit: Mask) -> bool:
 
 
 def _changes(
-    first: Array, second: Array, lit: Mask, cells: Sequence[tuple[Places, ...]], otherwise: Doubles | None = None
+    first: Array, second: Array, lit: Mask, cells: Sequence[Cell], otherwise: Doubles | None = None
 ) -> Doubles:
     """Median in each cell of the logarithm of the second of two images (H, W) over the first, where both are lit."""
     # A quotient, which is the same to the bit for frames times a power of two.

@@ -68,6 +68,14 @@ class Window:
         flow = link.forward.vectors[rows]
         return flow if self.reflections is None else flow + (index - len(self.frames) // 2) * self.reflections[rows]
 
+    @cached_property
+    def reflecting(self) -> Mask | None:
+        """Where (H, W) light moves beside the links; None: nowhere."""
+        if self.reflections is None:
+            return None
+        x, y = np.moveaxis(self.reflections, -1, 0)
+        return np.asarray((x != 0) | (y != 0))  # `any` over the last axis takes ten times as long
+
     @property
     def lit(self) -> PreparedFrame:
         """The frame nearest to the centre with any valid pixel."""

@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
 from hybrid.alignment.align import align
@@ -317,13 +318,19 @@ def _denoise_turned(frame: Frame, denoise: Callable[..., Array], **mode: Any) ->
     mirrored, turns = divmod(frame.orientation, 4)
 
     def turn(image: Array) -> Array:
-        # A copy: torch refuses a negative stride, also that of a side of one pixel, which counts as contiguous.
-        return np.rot90(image[:, ::-1] if mirrored else image, turns).copy()
+        image = cv2.flip(image, 1) if mirrored else image
+        return _rotate(image, turns)
 
     albedo, normal = (None if layer is None else turn(layer) for layer in (frame.albedo, frame.normal))
     turned = Frame(frame.number, turn(frame.color), albedo=albedo, normal=normal)
-    image = np.rot90(denoise_frame_oidn(turned, denoise, **mode), -turns)
-    return np.ascontiguousarray(image[:, ::-1] if mirrored else image)
+    image = _rotate(denoise_frame_oidn(turned, denoise, **mode), -turns % 4)
+    return cv2.flip(image, 1) if mirrored else image
+
+
+def _rotate(image: Array, turns: int) -> Array:
+    """An image (H, W, 3) turned counterclockwise by 0 to 3 quarters."""
+    codes = cv2.ROTATE_90_COUNTERCLOCKWISE, cv2.ROTATE_180, cv2.ROTATE_90_CLOCKWISE
+    return cv2.rotate(image, codes[turns - 1]) if turns else image
 
 
 def _checked(picture: Array | None, frame: Frame, highlights: Highlights | None = None) -> Array | None:

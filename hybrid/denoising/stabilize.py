@@ -37,6 +37,8 @@ Mask = NDArray[np.bool_]
 MOST, CORRECTED = 2.0, 1e4
 # Kinds of layers: the geometry of the frame before, and of the frame after.
 NEIGHBOURS = "before", "after"
+# Share of a frame's light in its fireflies below which no mean of it depends on them.
+_LITTLE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -244,8 +246,8 @@ class FrameDenoiser:
             stream.keeper.release()  # a mean reads the whole frame
         exposure, reflections, bands = window.lit.as_rendered.exposure, window.reflections, self._bands()
         shares = {"refine": float(np.mean(window.refined))} if window.refined else {}
-        if reflections is not None:
-            shares["reflections"] = float(reflections.any(axis=-1).mean())
+        if window.reflecting is not None:
+            shares["reflections"] = float(window.reflecting.mean())
         layers = _Layers(stream.shot.shape, stream.keeper.empty)
         outliers = 0
         stream.keeper.trim()
@@ -334,7 +336,8 @@ class FrameDenoiser:
                 # An error beside a lamp stays there: spread over a room, a halo of 60 pixels darkened it by 1 %.
                 far = counted & ~beside_lamps(color, exposure)
                 # First without fireflies: the mean of few bright samples is uncertain, that of all others is not.
-                for noisy in (radiance, rendered) if frame.removed_samples else (rendered,):
+                removed = frame.removed_radiance > _LITTLE * frame.mean
+                for noisy in (radiance, rendered) if removed else (rendered,):
                     color = restore_mean(color, _where(far, noisy, color), exposure)
         if sides is not None:
             with timings.stage("blend-samples"):

@@ -11,6 +11,7 @@ from hybrid.alignment.measure import (
     FIXED_NOISE_ABOVE,
     REPEATED,
     UNEQUAL,
+    Grain,
     correlation_alone,
     equal_noise,
     fixed_noise,
@@ -33,7 +34,7 @@ def test_strips_find_what_the_whole_picture_shows(changed, top):
     there, count = here.copy(), round(changed * 200)
     rows = slice(0, count) if top else slice(200 - count, 200)
     there[rows] = rng.gamma(1, 1, there[rows].shape)
-    grainy, equal = (np.count_nonzero(part) for part in equal_noise(here, there))
+    grainy, equal = (np.count_nonzero(part) for part in equal_noise(Grain(here), Grain(there)))
     expected = grainy >= FEW and equal >= REPEATED * grainy
     assert repeats(here, there) == expected
     assert expected == (changed < 0.01)
@@ -71,7 +72,7 @@ def test_pixels_that_one_sample_hits_or_misses_have_no_fixed_noise(lit):
     again = replace(first, number=2)
     assert abs(fixed_noise(first, second, moves=False)) < 0.3 * FIXED_NOISE_ABOVE
     assert fixed_noise(first, again, moves=False) == pytest.approx(1, abs=0.01)
-    grainy, equal = equal_noise(first.irradiance, second.irradiance)
+    grainy, equal = equal_noise(Grain(first.irradiance), Grain(second.irradiance))
     assert grainy.any()
     assert not equal.any()
     assert repeats(first.irradiance, again.irradiance)
