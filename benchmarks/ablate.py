@@ -74,7 +74,7 @@ RULES: dict[str, tuple[Any, str, Any]] = {
     "light of neighbours": (samples, "_relative_light", lambda n, m, rate: [np.ones_like(rate)] * 2),
     "noise far apart": (samples, "_APART", 1),
     "bound by trusted": (samples, "_MOSTLY", 2.0),
-    "outline noise": (hybrid.alignment.measure, "_outline_noise", _nothing),
+    "outline noise": (hybrid.alignment.measure, "measure_outline_noise", _nothing),
 }
 
 

@@ -71,9 +71,9 @@ RENDER = (
 )
 # Scenes of `benchmarks/scenes.py`, of small bright lamps and glass; one rule was chosen with them in view.
 SECOND = ("neon", "headlamps", "water")
-SECOND_LEVELS = {"s032": 32, "s128": 128}
+SECOND_LEVELS = {"s008": 8, "s032": 32, "s128": 128}
 RENDER_SECOND = (
-    *("--film", "320x180", "--size", "192x108", "--frames", "4-10", "--levels", "s032=32,s128=128"),
+    *("--film", "320x180", "--size", "192x108", "--frames", "4-10", "--levels", "s008=8,s032=32,s128=128"),
     *("--reference", "384", "--reference-frames", "6,7,8"),
 )
 # Shots with the defaults of Blender 5.0, whose files hold its denoised frames too: scene and options of each.

@@ -11,7 +11,7 @@ from nlm.drift import drift_weights, pull_to_centre
 from nlm.fireflies import Highlights, find_bright_samples, measure_highlights, replace_fireflies
 from nlm.gate import agreement_weight, color_gate, color_gates
 from nlm.guided import guided_filter, measure_guide
-from nlm.interpolation import interpolation_weight, measure_noise
+from nlm.interpolation import interpolation_weight
 from nlm.moving_lights import confirmed_by_neighbour, find_bright, passing_lights, trail_of
 from nlm.nonlocal_means import joint_nlm
 from nlm.parts import filter_layers, find_sums, split_light, sums_to
@@ -25,7 +25,7 @@ __all__ = [
     "beside_lamps", "blend_samples", "color_gate", "color_gates", "confirmed_by_neighbour",
     "drift_weights", "filter_layers", "find_bright", "find_bright_samples", "find_sums",
     "guided_filter", "interpolation_weight", "joint_nlm", "limit_lamps", "measure_guide", "measure_highlights",
-    "measure_noise", "passing_lights", "pool_samples", "prefilter_guide", "pull_to_centre", "reject_outliers",
+    "passing_lights", "pool_samples", "prefilter_guide", "pull_to_centre", "reject_outliers",
     "relight", "replace_fireflies", "replace_nonfinite", "restore_mean", "robust_average", "smooth_variance",
     "split_light", "sums_to", "trail_of", "variance_from_halves", "variance_from_window",
 ]  # fmt: skip

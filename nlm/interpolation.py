@@ -1,36 +1,9 @@
 """Weights of warped frames by errors of the warp that exceed the noise of the samples."""
 
-import cv2
 import numpy as np
 
 from loops.parallel import Floats
-from nlm.average import channel_mean, mean_square
-from nlm.gate import AROUND_SIZE
-
-
-def measure_noise(noisy: Floats, estimate: Floats, exposure: float) -> Floats:
-    """Measure the variance of a frame's samples.
-
-    Parameters
-    ----------
-    noisy, estimate : (H, W, 3) float32, the frame as rendered and denoised, in one unit
-    exposure : float, in that unit
-
-    Returns
-    -------
-    (H, W) float32
-        (l + exposure) · K[(noisy − estimate)² / (l + exposure)], l the estimate and the square in the mean over
-        channels, K the 15×15 mean.
-
-    Notes
-    -----
-    The variance of samples grows with their light. In the plain mean a lamp of thousands of exposures gives its noise
-    to the dark pixels beside it, and warped frames that spread the lamp over these count: 0.9 dB of a car's headlamps
-    at 128 samples.
-    """
-    light = np.maximum(channel_mean(estimate), 0) + np.float32(exposure)
-    # The running sums of a box filter round to a little below 0.
-    return np.asarray(light * np.maximum(cv2.blur(mean_square(noisy - estimate) / light, AROUND_SIZE), 0), np.float32)
+from nlm.average import mean_square
 
 
 def interpolation_weight(warped: Floats, bilinear: Floats, variance: Floats) -> Floats:
@@ -39,7 +12,7 @@ def interpolation_weight(warped: Floats, bilinear: Floats, variance: Floats) -> 
     Parameters
     ----------
     warped, bilinear : (H, W, 3) float32, a denoised frame warped by bicubic and by bilinear interpolation
-    variance : (H, W) float32, of the centre's samples, from `measure_noise`, in the square of their unit
+    variance : (H, W) float32, of the centre's samples, squared (`nlm.variance.variance_from_estimate`)
 
     Returns
     -------

@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 from numba import njit
 
-from loops.parallel import STRIP, Floats, Mask, run_bands
+from loops.parallel import Floats, Mask, run_bands
 from nlm.average import channel_mean, check_colors, check_strip, check_window
 from nlm.cells import Axis, between_cells, cell_axis, cell_means
 from nlm.pooling import RESIDUAL_LIMIT as _LIMIT
-from nlm.variance import WARPED, gaussian_mean, ratio, second_differences
+from nlm.variance import WARPED, gaussian_mean, ratio, spatial_variance
 
 # Deviations of its own noise that are subtracted from the detail that frames share. At 1, noise that looks like detail
 # costs up to 1.3 dB of a rendered shot at 8 samples.
@@ -28,8 +28,6 @@ _SCATTER = 2.0
 # to 64 dB gains 0.9 and 2.6 dB at 128 and 512 samples, and no shot at 8 to 512 samples loses 0.05 dB. With 2 the same
 # gains 1.3 and 3.1 dB, and another shot loses 0.5 dB at 32 samples.
 _UNSURE = 4.0
-# Between pixels this far apart no pixel filter of a renderer correlates the noise (σ = 1 pixel).
-_APART = 6
 # Where no neighbour is trusted, the noise counts this many times: no frame denoised alone, at 8 to 512 samples, then
 # loses 0.01 dB; at 1 one loses 0.4.
 _ALONE = 1.5
@@ -81,8 +79,6 @@ _LEFT = np.float32(1 - 1 / (4 * np.pi * _LIGHT**2))
 # 2.1, and with 2 the first frame lost 1.6 dB at 1 % of noise. Rare samples that only neighbours have exceed it: with
 # 2.5 a place of a wall without any became 70 % too bright, and with 4 a shot at 8 samples loses 0.05 dB.
 _RELIT = np.float32(2.25)
-# Albedo below that of any surface, by which light is divided in place of black.
-LEAST_ALBEDO = np.float32(1e-3)
 # Cells per deviation of a mean.
 _CELLS = 4
 _WARPED = np.float32(WARPED)
@@ -197,7 +193,7 @@ def blend_samples(
     around, nearest = gaussian_mean(temporal, _SIGMA), gaussian_mean(nearest, _SIGMA)
     temporal *= np.divide(np.minimum(nearest, around), around, out=np.ones_like(around), where=around > 0)
     del around, nearest
-    spatial = spatial_variance(noisy, blended, rate, albedo)
+    spatial = spatial_variance(noisy, blended, rate, _SIGMA, albedo)
     if variance is None:
         alone = np.float32(_ALONE) * spatial
         red, green, blue = np.moveaxis(noisy != 0, -1, 0)
@@ -245,53 +241,6 @@ def _relative_light(noisy: Floats, neighbours: SampleMean, rate: Floats) -> list
             np.clip(np.divide(together, alone, out=np.ones_like(alone), where=alone > 0), 1 / _RELIT, _RELIT)
         )
     return factors
-
-
-def spatial_variance(noisy: Floats, picture: Floats, rate: Floats, albedo: Floats | None = None) -> Floats:
-    """Variance (H, W) of a frame's noise, relative to the light (`rate` is one over that), summed over channels.
-
-    The least of the high-pass energies of ``noisy``, ``noisy − picture`` and, times the albedo, ``noisy / albedo``:
-    detail of the frame adds to the first, detail that the picture has lost or invented to the second, that of the
-    light to the third (Immerkær, as `nlm.variance.variance_from_residual`).
-    A renderer's pixel filter makes noise smooth, and these energies up to 150 times too small; the median over the
-    frame of the same energies at pixels 6 apart, over these, is the factor.
-    """
-    some = np.s_[::_APART, ::_APART]
-    near = _least_energy(noisy, picture, rate, albedo)
-    few, shown, rates = (np.ascontiguousarray(layer[some]) for layer in (noisy, picture, rate))
-    far = _least_energy(few, shown, rates, None if albedo is None else albedo[some], 2.0)
-    around = gaussian_mean(near[some], 2.0)
-    factors = np.divide(far, around, out=np.zeros_like(far), where=around > 0)
-    return near * np.float32(max(np.median(factors[factors > 0]), 1) if factors.any() else 1)
-
-
-def _least_energy(noisy: Floats, picture: Floats, rate: Floats, albedo: Floats | None, sigma: float = _SIGMA) -> Floats:
-    """Least Gaussian mean of the energies of a frame, of its difference from a picture, and of its light."""
-    ways = [(None, None), (picture, None), *([] if albedo is None else [(None, albedo)])]
-    least = np.full_like(rate, np.inf)
-    for way in ways:
-        np.minimum(least, gaussian_mean(_energy_of(noisy, rate, *way), sigma), out=least)
-    return least
-
-
-def _energy_of(noisy: Floats, rate: Floats, picture: Floats | None, albedo: Floats | None) -> Floats:
-    """Squares of second differences relative to the light, summed over channels: of white noise its variance.
-
-    The image is `noisy`, its difference from a picture, or its light; in strips, which stay in the caches.
-    """
-    energy = np.empty(rate.shape, np.float32)
-    for top in range(0, len(rate), STRIP):
-        rows, bottom = slice(top, top + STRIP), min(top + STRIP, len(rate))
-        outer = slice(max(top - 1, 0), bottom + 1)
-        strip = noisy[outer] if picture is None else noisy[outer] - picture[outer]
-        if albedo is not None:
-            strip = strip / np.maximum(albedo[outer], LEAST_ALBEDO)
-        found = second_differences(np.ascontiguousarray(strip))[top - outer.start :]
-        if albedo is not None:
-            found = found[: bottom - top] * np.maximum(albedo[rows], LEAST_ALBEDO)
-        found = found[: bottom - top] * rate[rows, :, None]
-        energy[rows] = np.einsum("yxc,yxc->yx", found, found) / np.float32(36)  # the squares of the coefficients
-    return energy
 
 
 def beside_lamps(picture: Floats, exposure: float) -> Mask:

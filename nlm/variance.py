@@ -1,4 +1,4 @@
-"""Variance of a pixel's value: from half buffers, from the aligned window, from the image alone."""
+"""Variance of a pixel's value: from half buffers, the aligned window, a denoised picture, or the image alone."""
 
 from collections.abc import Callable, Iterator
 
@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 from numba import njit
 
-from loops.parallel import Floats, Mask, run_bands
-from nlm.average import check_window
+from loops.parallel import STRIP, Floats, Mask, run_bands
+from nlm.average import channel_mean, check_window, mean_square
+from nlm.gate import AROUND_SIZE
 from nlm.nonlocal_means import BAND, joint_nlm
 
 # How far above its surroundings' median a pixel's variance may lie before it is cut. A variance from five
@@ -21,6 +22,10 @@ WARPED = 0.7
 _NOISELESS = np.float32(1e-6)
 # Least variance, of deviations of 1e-4: below that is what the box filters round to, which depends on where they began.
 _LEAST = np.float32(1e-8)
+# Between pixels this far apart no pixel filter of a renderer correlates the noise (σ = 1 pixel).
+_APART = 6
+# Albedo below that of any surface, by which light is divided in place of black.
+LEAST_ALBEDO = np.float32(1e-3)
 # Beyond this share of the columns a window is filtered as a whole.
 _MOST_COLUMNS = 0.75
 
@@ -74,6 +79,80 @@ def variance_from_residual(image: Floats) -> Floats:
     its squared coefficients, 36 (Immerkær, Fast noise variance estimation, 1996, doi:10.1006/cviu.1996.0060).
     """
     return smooth_variance(np.square(second_differences(image)) * np.float32(1 / 36))
+
+
+def variance_from_estimate(noisy: Floats, estimate: Floats, exposure: float) -> Floats:
+    """Variance of a frame's samples by its difference from a denoised frame.
+
+    Parameters
+    ----------
+    noisy, estimate : (H, W, 3) float32, the frame as rendered and denoised, in one unit
+    exposure : float, in that unit
+
+    Returns
+    -------
+    (H, W) float32
+        (l + exposure) · K[(noisy − estimate)² / (l + exposure)], l the estimate and the square in the mean over
+        channels, K the 15×15 mean.
+
+    Notes
+    -----
+    The variance of samples grows with their light. In the plain mean a lamp of thousands of exposures gives its noise
+    to the dark pixels beside it, and warped frames that spread the lamp over these count: 0.9 dB of a car's headlamps
+    at 128 samples.
+    """
+    light = np.maximum(channel_mean(estimate), 0) + np.float32(exposure)
+    # The running sums of a box filter round to a little below 0.
+    return np.asarray(light * np.maximum(cv2.blur(mean_square(noisy - estimate) / light, AROUND_SIZE), 0), np.float32)
+
+
+def spatial_variance(
+    noisy: Floats, picture: Floats, rate: Floats, sigma: float, albedo: Floats | None = None
+) -> Floats:
+    """Variance (H, W) of a frame's noise, relative to the light, summed over channels, by a Gaussian of `sigma` pixels.
+
+    `rate` (H, W) is one over the light. The least of the high-pass energies of ``noisy``, ``noisy − picture`` and, times
+    the albedo, ``noisy / albedo``: detail of the frame adds to the first, detail that the picture has lost or invented
+    to the second, that of the light to the third (as `variance_from_residual`).
+    A renderer's pixel filter makes noise smooth, and these energies up to 150 times too small; the median over the
+    frame of the same energies at pixels 6 apart, over these, is the factor.
+    """
+    some = np.s_[::_APART, ::_APART]
+    near = _least_energy(noisy, picture, rate, albedo, sigma)
+    few, shown, rates = (np.ascontiguousarray(layer[some]) for layer in (noisy, picture, rate))
+    far = _least_energy(few, shown, rates, None if albedo is None else albedo[some], 2.0)
+    around = gaussian_mean(near[some], 2.0)
+    factors = np.divide(far, around, out=np.zeros_like(far), where=around > 0)
+    return near * np.float32(max(np.median(factors[factors > 0]), 1) if factors.any() else 1)
+
+
+def _least_energy(noisy: Floats, picture: Floats, rate: Floats, albedo: Floats | None, sigma: float) -> Floats:
+    """Least Gaussian mean of the energies of a frame, of its difference from a picture, and of its light."""
+    ways = [(None, None), (picture, None), *([] if albedo is None else [(None, albedo)])]
+    least = np.full_like(rate, np.inf)
+    for way in ways:
+        np.minimum(least, gaussian_mean(_energy_of(noisy, rate, *way), sigma), out=least)
+    return least
+
+
+def _energy_of(noisy: Floats, rate: Floats, picture: Floats | None, albedo: Floats | None) -> Floats:
+    """Squares of second differences relative to the light, summed over channels: of white noise its variance.
+
+    The image is `noisy`, its difference from a picture, or its light; in strips, which stay in the caches.
+    """
+    energy = np.empty(rate.shape, np.float32)
+    for top in range(0, len(rate), STRIP):
+        rows, bottom = slice(top, top + STRIP), min(top + STRIP, len(rate))
+        outer = slice(max(top - 1, 0), bottom + 1)
+        strip = noisy[outer] if picture is None else noisy[outer] - picture[outer]
+        if albedo is not None:
+            strip = strip / np.maximum(albedo[outer], LEAST_ALBEDO)
+        found = second_differences(np.ascontiguousarray(strip))[top - outer.start :]
+        if albedo is not None:
+            found = found[: bottom - top] * np.maximum(albedo[rows], LEAST_ALBEDO)
+        found = found[: bottom - top] * rate[rows, :, None]
+        energy[rows] = np.einsum("yxc,yxc->yx", found, found) / np.float32(36)  # the squares of the coefficients
+    return energy
 
 
 def second_differences(image: Floats) -> Floats:

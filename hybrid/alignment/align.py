@@ -29,9 +29,10 @@ from hybrid.runtime.timing import Timings
 from nlm.average import average, reject_outliers
 from nlm.drift import drift_weights, pull_to_centre
 from nlm.gate import agreement_weight, color_gate, color_gates
-from nlm.interpolation import interpolation_weight, measure_noise
+from nlm.interpolation import interpolation_weight
 from nlm.relight import relight
 from nlm.samples import SampleMean, average_neighbours
+from nlm.variance import variance_from_estimate
 
 # Scale of the gate of results, relative to a frame's noise: everywhere, and where the light stands still (`nlm.drift`)
 # and the mean difference is subtracted (`nlm.relight`). With the second alone results are steadier by 0.2 dB, and
@@ -402,7 +403,7 @@ def _warp_first_pass(
     weights: list[Array | None] = [None] * len(first_pass)
     noise = None
     if weigh:
-        noise = measure_noise(window.centre.radiance[rows], middle[rows], measure_exposure(middle))
+        noise = variance_from_estimate(window.centre.radiance[rows], middle[rows], measure_exposure(middle))
     for index, (picture, link) in enumerate(zip(first_pass, window.links, strict=True)):
         flow = window.light_flow(index, rows)
         if link is None or flow is None or picture is None:

@@ -6,17 +6,16 @@ from itertools import product
 
 import numpy as np
 
-from hybrid.alignment.measure import (
+from hybrid.alignment.fade import measure_fade, scaled
+from hybrid.alignment.noise import (
     MOVED_NOISE,
     NEAR,
     SAME,
     Grain,
     equal_noise,
-    measure_fade,
     noise_free_around,
     repeats,
     same_noise_at,
-    scaled,
 )
 from hybrid.alignment.prepare import PreparedFrame, rendered_flow
 from hybrid.files.frame import Array

@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flow.guide import GuidePair, make_guide, pair_guides
+from flow.guide import GuidePair, make_guide, pair_guides, tone_map
 from flow.motion import compose_flow, forward_backward_error
 from flow.selection import select_flow
-from flow.tvl1 import dense_flow
+from flow.tvl1 import dense_flow, rough_flow
 from hybrid.alignment.prepare import PreparedFrame, rendered_flow
 from hybrid.alignment.transfer import measure_exposure
 from hybrid.files.frame import Array
@@ -86,3 +86,10 @@ def compose_flows(first: Flow | None, second: Flow | None) -> Flow | None:
     if first is None or second is None:
         return None
     return Flow(*compose_flow(first.vectors, second.vectors, first_valid=first.valid, second_valid=second.valid))
+
+
+def search_flow(picture: Array, other: Array) -> tuple[Array, Mask]:
+    """Return a rough optical flow between two pictures (H, W, 3), valid everywhere."""
+    exposure = measure_exposure(picture, other)
+    flow = rough_flow(tone_map(other, exposure), tone_map(picture, exposure))
+    return flow, np.ones(flow.shape[:2], bool)

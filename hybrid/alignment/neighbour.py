@@ -7,7 +7,7 @@ from numba import njit
 
 from flow.confidence import GuideNoise, estimate_confidence, find_coverage
 from hybrid.alignment.flows import Link
-from hybrid.alignment.measure import MOVED_NOISE
+from hybrid.alignment.noise import MOVED_NOISE
 from hybrid.alignment.prepare import PreparedFrame
 from hybrid.alignment.window import Geometry
 from hybrid.files.frame import Array

@@ -24,6 +24,9 @@ Values = TypeVar("Values", bound=NDArray[Any])
 
 # Name of the alpha channel among the AOVs; unlike the others it is no light, and is not demodulated.
 ALPHA = "alpha"
+# Rows to which frames are reduced for measuring: a mean of k×k pixels has a k-th of their noise, and a k²-th of their
+# cost. Frames below twice this are not reduced.
+SHORT_SIDE = 270
 
 
 class Brightness(NamedTuple):

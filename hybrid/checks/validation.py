@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from flow.convention import SCALES, Choice, Trial, choose_convention
 from flow.guide import median_luminance, tone_map
 from flow.patches import FramePair, Patches
-from hybrid.alignment.measure import SHORT_SIDE, correlation
+from hybrid.alignment.noise import correlation
+from hybrid.alignment.prepare import SHORT_SIDE
 from hybrid.checks.grade import Grade, find_grade
 from hybrid.checks.pass_sums import classify_passes, sample_rows
 from hybrid.files.frame import Array, Frame

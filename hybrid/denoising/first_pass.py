@@ -17,7 +17,7 @@ import numpy as np
 
 from hybrid.alignment.align import align
 from hybrid.alignment.fireflies import REACH
-from hybrid.alignment.measure import FIXED_NOISE_ABOVE
+from hybrid.alignment.noise import FIXED_NOISE_ABOVE
 from hybrid.alignment.transfer import BLACK, measure_gain
 from hybrid.checks.validation import STRAY, find_lost_light, find_other_frame, find_sequence_grade
 from hybrid.denoising.oidn import HOLDS, HOLDS_FAST, denoise_oidn, find_device, why_no_oidn
@@ -318,19 +318,18 @@ def _denoise_turned(frame: Frame, denoise: Callable[..., Array], **mode: Any) ->
     mirrored, turns = divmod(frame.orientation, 4)
 
     def turn(image: Array) -> Array:
-        image = cv2.flip(image, 1) if mirrored else image
-        return _rotate(image, turns)
+        return _rotate(np.asarray(cv2.flip(image, 1), np.float32) if mirrored else image, turns)
 
     albedo, normal = (None if layer is None else turn(layer) for layer in (frame.albedo, frame.normal))
     turned = Frame(frame.number, turn(frame.color), albedo=albedo, normal=normal)
     image = _rotate(denoise_frame_oidn(turned, denoise, **mode), -turns % 4)
-    return cv2.flip(image, 1) if mirrored else image
+    return np.asarray(cv2.flip(image, 1), np.float32) if mirrored else image
 
 
 def _rotate(image: Array, turns: int) -> Array:
     """An image (H, W, 3) turned counterclockwise by 0 to 3 quarters."""
     codes = cv2.ROTATE_90_COUNTERCLOCKWISE, cv2.ROTATE_180, cv2.ROTATE_90_CLOCKWISE
-    return cv2.rotate(image, codes[turns - 1]) if turns else image
+    return np.asarray(cv2.rotate(image, codes[turns - 1]), np.float32) if turns else image
 
 
 def _checked(picture: Array | None, frame: Frame, highlights: Highlights | None = None) -> Array | None:

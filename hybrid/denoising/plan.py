@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybrid.alignment.measure import FIXED_NOISE_ABOVE, STILL, Correlation, FrameFacts, PairFacts, least_outline_noise
+from hybrid.alignment.measure import FrameFacts, PairFacts, least_outline_noise
+from hybrid.alignment.noise import FIXED_NOISE_ABOVE, STILL, Correlation
 from hybrid.files.sequences import format_frames
 
 #: Stages by name, in order. A figure calls for some; others (`_switch`) run wherever their input is there.

@@ -15,29 +15,27 @@ import numpy as np
 from flow.reflections import find_reflections
 from flow.tvl1 import refine_flow
 from hybrid.alignment.align import align, expect_equal_layers
+from hybrid.alignment.fade import NO_FADE, Fade, inverse, relit, scaled
 from hybrid.alignment.fireflies import REACH, remove_fireflies
 from hybrid.alignment.flows import Flow, Link, PairFlows, compose_flows, measure_flows
 from hybrid.alignment.guides import GuideFilter
 from hybrid.alignment.measure import (
-    FIXED_NOISE_ABOVE,
-    NO_FADE,
-    Correlation,
-    Fade,
     FrameFacts,
     PairFacts,
     SmallFrame,
-    correlation_alone,
-    fixed_noise,
-    inverse,
     least_outline_noise,
     measure_frame,
     measure_pair,
+    shrink,
+)
+from hybrid.alignment.noise import (
+    FIXED_NOISE_ABOVE,
+    Correlation,
+    correlation_alone,
+    fixed_noise,
     noise_correlation,
     relative_residual,
-    relit,
-    scaled,
     shared_residual,
-    shrink,
 )
 from hybrid.alignment.prepare import PreparedFrame, prepare, prepared_planes, without_filter
 from hybrid.alignment.residual import Limited, measure_limited

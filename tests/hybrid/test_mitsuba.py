@@ -1,9 +1,5 @@
-"""Shots of Mitsuba 3: its AOV integrator's files need no option, and noise that its default filter spreads is found.
+"""Shots of Mitsuba 3: its AOV integrator's files need no option."""
 
-The second is `tests/data/mitsuba`, rendered beforehand by `tests/data/render_mitsuba.py`.
-"""
-
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +7,9 @@ import pytest
 
 from hybrid.cli import main
 from hybrid.comparison.metrics import psnr
-from hybrid.denoising.oidn import denoise_oidn
-from hybrid.denoising.plan import Rules
-from hybrid.denoising.stream import FrameStream
 from hybrid.files.shots import open_shot
-from ravg import denoise_shot
 
 FRAMES = range(1, 4)
-GAUSSIAN = Path(__file__).resolve().parent.parent / "data" / "mitsuba"
 
 
 def scene(frame: int, samples: int) -> object:
@@ -89,24 +80,3 @@ def test_what_mitsuba_renders_is_found_and_denoised(tmp_path: Path, capsys: pyte
     denoised = open_shot(tmp_path / "out").read(2).color
     assert np.isfinite(denoised).all()
     assert psnr(denoised, reference) > psnr(noisy, reference) + 3
-
-
-@pytest.mark.oidn
-@pytest.mark.skipif(find_spec("pyoidn") is None, reason="pyoidn is not installed")
-@pytest.mark.parametrize("name", ["noisy.####.exr", "noisy.0003.exr"])
-def test_noise_that_the_default_filter_spreads_is_removed_from_a_shot_and_a_single_frame(
-    tmp_path: Path, name: str
-) -> None:
-    shot = open_shot(GAUSSIAN / name)
-    stream = FrameStream(shot, Rules())
-    (facts,), _ = stream.measurements([3])
-    assert facts.noise_correlation is not None
-    along_x, along_y = facts.noise_correlation
-    assert min(along_x[0], along_y[0]) > 0.3  # by the kernel 0.42; 100 tiles and fewer err by 0.05
-    assert (facts.noise_correlation_alone is not None) == (len(shot.numbers) == 1)
-    list(denoise_shot(shot, str(tmp_path / "frame.####.exr"), preset="fast"))
-    denoised = open_shot(tmp_path).read(3).color
-    noisy = shot.read(3)
-    references = tuple(open_shot(GAUSSIAN / f"reference_{half}.####.exr").read(3).color for half in "ab")
-    best = denoise_oidn(noisy.color, noisy.albedo, noisy.normal, prefilter="high")
-    assert psnr(denoised, references) > psnr(best, references) + 3  # OIDN takes the noise for detail

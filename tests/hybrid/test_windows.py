@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid.alignment.measure import fixed_noise
+from hybrid.alignment.noise import fixed_noise
 from hybrid.alignment.prepare import prepare
 from hybrid.cli import main
 from hybrid.denoising.first_pass import PerFrame

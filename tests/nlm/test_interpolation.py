@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from nlm.interpolation import interpolation_weight, measure_noise
+from nlm.interpolation import interpolation_weight
+from nlm.variance import variance_from_estimate
 
 
 def images(*values: float) -> list[np.ndarray]:
@@ -41,8 +42,8 @@ def test_noise_is_that_of_the_samples() -> None:
     estimate = np.full((60, 60, 3), rng.random(), np.float32)
     noisy = estimate + rng.normal(0, 0.2, estimate.shape).astype(np.float32)
     # 675 samples: a variance is known to 5.4 %, and four deviations are 22 %.
-    np.testing.assert_allclose(measure_noise(noisy, estimate, 0.5)[8:-8, 8:-8], 0.04, rtol=0.22)
-    assert (measure_noise(estimate, estimate, 0.5) == 0).all()
+    np.testing.assert_allclose(variance_from_estimate(noisy, estimate, 0.5)[8:-8, 8:-8], 0.04, rtol=0.22)
+    assert (variance_from_estimate(estimate, estimate, 0.5) == 0).all()
 
 
 def test_a_lamp_does_not_give_its_noise_to_the_dark_pixels_beside_it() -> None:
@@ -51,7 +52,9 @@ def test_a_lamp_does_not_give_its_noise_to_the_dark_pixels_beside_it() -> None:
     estimate[20, 20] = 5000
     noisy = (estimate * rng.gamma(100, 0.01, (40, 40, 1))).astype(np.float32)
     noisy[20, 20] = 5500
-    alone = measure_noise(np.where(estimate > 1, 0.1, noisy).astype(np.float32), np.full_like(estimate, 0.1), 0.1)
-    beside = measure_noise(noisy, estimate, 0.1)
+    alone = variance_from_estimate(
+        np.where(estimate > 1, 0.1, noisy).astype(np.float32), np.full_like(estimate, 0.1), 0.1
+    )
+    beside = variance_from_estimate(noisy, estimate, 0.1)
     assert beside[20, 22] < 1e-3 * 500**2 / 225  # a thousandth of the plain mean
     assert beside[5, 5] == pytest.approx(alone[5, 5], rel=1e-3)

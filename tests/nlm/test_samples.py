@@ -13,8 +13,8 @@ from nlm.samples import (
     blend_samples,
     limit_lamps,
     restore_mean,
-    spatial_variance,
 )
+from nlm.variance import spatial_variance
 from tests.seldom import seldom
 
 SHAPE = (96, 128)
@@ -225,7 +225,7 @@ def test_the_variance_of_noise_that_a_pixel_filter_spreads_is_measured(spread: f
     grain = np.random.default_rng(7).standard_normal(ONES.shape).astype(np.float32)
     spread_grain = cv2.GaussianBlur(grain, (0, 0), spread)
     for noise in (grain, spread_grain):
-        found = spatial_variance(ONES + np.float32(0.05) * noise, ONES, np.ones(SHAPE, np.float32))
+        found = spatial_variance(ONES + np.float32(0.05) * noise, ONES, np.ones(SHAPE, np.float32), 4.0)
         assert found.mean() == pytest.approx(3 * 0.05**2 * noise.var(), rel=0.2)
 
 
@@ -233,7 +233,7 @@ def test_texture_in_the_albedo_is_no_noise() -> None:
     """On this wall it was 0.16, and pictures at 60 dB were left as they were."""
     albedo = np.random.default_rng(3).uniform(0.2, 0.8, (24, 32, 3)).astype(np.float32).repeat(4, 0).repeat(4, 1)
     own = noisy(albedo, 0.01, 8)
-    found = spatial_variance(own, np.full_like(own, 0.5), 1 / albedo.mean(axis=-1), albedo)
+    found = spatial_variance(own, np.full_like(own, 0.5), 1 / albedo.mean(axis=-1), 4.0, albedo)
     assert found.mean() == pytest.approx(3 * 0.01**2, rel=0.3)  # channels vary by a fifth
 
 

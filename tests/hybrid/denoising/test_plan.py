@@ -4,7 +4,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from hybrid.alignment.measure import NO_FADE, FrameFacts
+from hybrid.alignment.fade import NO_FADE
+from hybrid.alignment.measure import FrameFacts
 from hybrid.denoising.first_pass import PerFrame
 from hybrid.denoising.plan import DENOISED, NOISY, STAGES, Context, Rules, merge
 from hybrid.denoising.stream import FrameStream, plan_shot

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hybrid.alignment.measure import fixed_noise
+from hybrid.alignment.noise import fixed_noise
 from hybrid.commands.shots import log_noise
 from hybrid.denoising.first_pass import PerFrame, find_first_pass
 from hybrid.denoising.plan import DENOISED, Rules
