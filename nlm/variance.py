@@ -109,7 +109,7 @@ def variance_from_estimate(noisy: Floats, estimate: Floats, exposure: float) -> 
 def spatial_variance(
     noisy: Floats, picture: Floats, rate: Floats, sigma: float, albedo: Floats | None = None
 ) -> Floats:
-    """Variance (H, W) of a frame's noise, relative to the light, summed over channels, by a Gaussian of `sigma` pixels.
+    """Variance (H, W) of a frame's noise over the light, summed over channels, by a Gaussian of `sigma` pixels.
 
     `rate` (H, W) is one over the light. The least of the high-pass energies of ``noisy``, ``noisy − picture`` and, times
     the albedo, ``noisy / albedo``: detail of the frame adds to the first, detail that the picture has lost or invented
