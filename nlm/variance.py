@@ -111,9 +111,9 @@ def spatial_variance(
 ) -> Floats:
     """Variance (H, W) of a frame's noise over the light, summed over channels, by a Gaussian of `sigma` pixels.
 
-    `rate` (H, W) is one over the light. The least of the high-pass energies of ``noisy``, ``noisy − picture`` and, times
-    the albedo, ``noisy / albedo``: detail of the frame adds to the first, detail that the picture has lost or invented
-    to the second, that of the light to the third (as `variance_from_residual`).
+    `rate` (H, W) is one over the light. The least of the high-pass energies of ``noisy``, ``noisy − picture`` and,
+    times the albedo, ``noisy / albedo``: detail of the frame adds to the first, detail that the picture has lost or
+    invented to the second, that of the light to the third (as `variance_from_residual`).
     A renderer's pixel filter makes noise smooth, and these energies up to 150 times too small; the median over the
     frame of the same energies at pixels 6 apart, over these, is the factor.
     """
