@@ -53,22 +53,42 @@ def convolve_transformed(
     C is a multiple of 8, O of 16, K is 3 or 2. Features beyond the borders count as 0, with K = 2 those of one row and
     column on each side: the result is then a row and a column larger. It is channels last.
     """
-    pixels = x.permute(0, 2, 3, 1).contiguous().numpy()
-    (outputs, channels, taps), count = weight.shape[:3], len(x)
-    height, width = (length + 3 - taps for length in x.shape[2:])
     kept = added is not None
     if added is None:
-        added = torch.empty(count, outputs, height, width, memory_format=torch.channels_last)
-    result = added.permute(0, 2, 3, 1).numpy()
+        height, width = (length + 3 - len(weight[0, 0]) for length in x.shape[2:])
+        added = torch.empty(len(x), len(weight), height, width, memory_format=torch.channels_last)
+    _run(x, weight, bias, added, relu=relu, kept=kept)
+    return added
+
+
+def convolve_interleaved(x: Tensor, weight: Tensor) -> Tensor:
+    """Convolve ``(N, C, H, W)`` by taps ``(4·O, C, 2, 2)`` of the four pixels of a feature: ``(N, O, 2·H, 2·W)``.
+
+    C and O are multiples of 8. Pixel (2i − r, 2j − c) is the result (i, j) of the taps of row r and column c, which
+    are the (2r + c)-th O outputs of the whole convolution. The result is channels last.
+    """
+    height, width = x.shape[2:]
+    result = torch.empty(len(x), len(weight) // 4, 2 * height, 2 * width, memory_format=torch.channels_last)
+    _run(x, weight, None, result, side=2)
+    return result
+
+
+def _run(
+    x: Tensor, weight: Tensor, bias: Tensor | None, result: Tensor, *, relu: bool = False, kept: bool = False,
+    side: int = 1,
+) -> None:  # fmt: skip
+    """Write the convolution, plus what is in it if `kept`, into a result of side × side pixels for each place."""
+    pixels = x.permute(0, 2, 3, 1).contiguous().numpy()
+    outputs, channels, taps = weight.shape[:3]
+    height, width = (length + 3 - taps for length in x.shape[2:])
     offset = np.zeros(outputs, np.float32) if bias is None else bias.numpy()
     tiles = -(-width // _STEP)
     chunks = -(-tiles // (ROWS * max(_VALUES // max(outputs, channels) // ROWS, 1)))
     together = -(-tiles // chunks)  # as many in each chunk
     floor = np.float32(0 if relu else -np.inf)
     values = _transform_weight(weight), offset
-    units = count * -(-height // _STEP) * chunks
-    run_bands(_convolve, units, taps, pixels, *values, floor, kept, result, together)
-    return added
+    units = len(x) * -(-height // _STEP) * chunks
+    run_bands(_convolve, units, taps, pixels, *values, floor, kept, result.permute(0, 2, 3, 1).numpy(), together, side)
 
 
 def _transform_weight(weight: Tensor) -> Floats:
@@ -189,10 +209,11 @@ _finish3, _finish2 = _finisher(_POINTS[3]), _finisher(_POINTS[2])
 @njit(cache=True, nogil=True)
 def _convolve(
     first: int, last: int, taps: int, pixels: Floats, weight: Floats, bias: Floats, floor: Any, kept: bool,
-    result: Floats, together: int,
+    result: Floats, together: int, side: int,
 ) -> None:  # fmt: skip
     # A unit is `together` tiles of a row of tiles, whatever the threads: the same bits with any number of them.
-    _, height, width, outputs = result.shape
+    _, all_rows, all_columns, depth = result.shape
+    height, width, outputs = all_rows // side + side - 1, all_columns // side + side - 1, depth * side * side
     _, in_height, in_width, channels = pixels.shape
     size = _STEP + taps - 1
     tiles, below = -(-width // _STEP), -(-height // _STEP)
@@ -234,22 +255,37 @@ def _convolve(
                     )  # fmt: skip
         for t in range(count):
             left = x + t * _STEP
-            inside = y + _STEP <= height and left + _STEP <= width
-            start, row = ((image * height + y) * width + left) * outputs, width * outputs
-            target, place, target_row = (all_results, start, row) if inside else (piece, 0, _STEP * outputs)
+            # The first and the last place have pixels of some outputs alone.
+            least, beyond = side - 1, _STEP + side - 1
+            inside = y >= least and left >= least and y + beyond <= height and left + beyond <= width
             rows, columns = min(_STEP, height - y), min(_STEP, width - left)
-            if kept and not inside:
+            target, target_row, column = piece, _STEP * outputs, outputs
+            if inside:
+                target, target_row, column = all_results, side * all_columns * depth, side * depth
+            elif kept:
+                start = ((image * height + y) * width + left) * outputs
                 for r in range(rows):
                     for n in range(columns * outputs):
-                        piece[r * target_row + n] = all_results[start + r * row + n]
-            added, before, added_row, column = (target, place, target_row, outputs) if kept else (nothing, 0, 0, 0)
+                        piece[r * target_row + n] = all_results[start + r * width * outputs + n]
+            added, added_row, added_column = (target, target_row, column) if kept else (nothing, 0, 0)
             for c in range(0, outputs, LANES):
-                given = (added, before + (c if kept else 0), added_row, column, target, place + c, target_row, outputs)
+                place = c
+                if inside:
+                    down, right = c // depth // side, c // depth % side
+                    first_row, first_column = image * all_rows + side * y - down, side * left - right
+                    place = (first_row * all_columns + first_column) * depth + c % depth
+                given = (added, place if kept else 0, added_row, added_column, target, place, target_row, column)
                 if taps == 3:
                     _finish3(products, t * outputs + c, products_distance, bias, c, floor, *given)
                 else:
                     _finish2(products, t * outputs + c, products_distance, bias, c, floor, *given)
             if not inside:
                 for r in range(rows):
-                    for n in range(columns * outputs):
-                        all_results[start + r * row + n] = piece[r * target_row + n]
+                    for n in range(columns):
+                        for part in range(side * side):
+                            i, j = side * (y + r) - part // side, side * (left + n) - part % side
+                            if 0 <= i < all_rows and 0 <= j < all_columns:
+                                start = ((image * all_rows + i) * all_columns + j) * depth
+                                first_channel = r * target_row + n * outputs + part * depth
+                                for c in range(depth):
+                                    all_results[start + c] = piece[first_channel + c]

@@ -7,7 +7,7 @@ from torch.nn import functional
 from loops.parallel import limit_loops, thread_count
 from network.cpu import winograd
 from network.cpu.convolution import convolve
-from network.cpu.winograd import can_transform, convolve_transformed
+from network.cpu.winograd import can_transform, convolve_interleaved, convolve_transformed
 
 
 def layers(size: tuple[int, int], channels: int, outputs: int, taps: int = 3, batch: int = 1) -> list[torch.Tensor]:
@@ -40,6 +40,21 @@ def test_it_is_the_sum_of_products(size: tuple[int, int], channels: int, outputs
     torch.testing.assert_close(found.double(), shifted, rtol=0, atol=2e-5)
     assert found.data_ptr() == added.data_ptr()
     assert bare.is_contiguous(memory_format=torch.channels_last)
+
+
+@pytest.mark.parametrize(("size", "outputs"), [((1, 1), 16), ((3, 9), 8), ((4, 4), 48), ((13, 31), 32), ((6, 400), 16)])
+def test_the_results_of_four_pixels_are_interleaved(size: tuple[int, int], outputs: int) -> None:
+    (height, width), (x, weight, _, _) = size, layers(size, 24, 4 * outputs, 2, batch=2)
+    parts = functional.conv2d(x.double(), weight.double(), padding=1).unflatten(1, (2, 2, outputs))
+    expected = torch.empty(2, outputs, 2 * height, 2 * width, dtype=torch.double)
+    for row in range(2):
+        for column in range(2):
+            part = parts[:, row, column, :, row : row + height, column : column + width]
+            expected[..., row::2, column::2] = part
+    with torch.no_grad():
+        found = convolve_interleaved(x, weight)
+    torch.testing.assert_close(found.double(), expected, rtol=0, atol=2e-5)
+    assert found.is_contiguous(memory_format=torch.channels_last)
 
 
 @pytest.mark.parametrize("taps", [3, 2])
