@@ -37,11 +37,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import ladder
 from bench_shot import REPEAT, measure, write_shot
 
+from hybrid.alignment.transfer import measure_exposure
+from hybrid.comparison.metrics import psnr
 from hybrid.files.exr import read_exr
 from hybrid.files.frame import Array
 from hybrid.files.movies import write_movie
 from hybrid.files.png import display_exposure, encode_bytes, write_label, write_png
 from hybrid.files.shots import Shot
+from nlm.average import channel_mean
 from ravg import open_shot
 from tests.exr_files import write_layers
 
@@ -112,6 +115,8 @@ OTHERS: dict[str, tuple[str, ...]] = {
 }
 LIGHT = ("Combined", "Denoising Albedo", "Denoising Normal")
 TIMED_FRAMES = 8
+# Exposures beyond which light is a lamp, whose rims are judged by themselves.
+RIM = 4.0
 Results = dict[str, Any]
 
 
@@ -219,8 +224,30 @@ def measure_ladder(record: Record, options: argparse.Namespace) -> None:
 
 
 def measure_second(record: Record, options: argparse.Namespace) -> None:
+    """PSNR and temporal PSNR, then PSNR at rims of lamps, elsewhere, and of each frame."""
     for name, level in product(SECOND, SECOND_LEVELS):
-        judge(record, "second", f"{name} {level}", ladder.Truth(find_shot(name, options)), level, NAMES)
+        truth = ladder.Truth(find_shot(name, options))
+        shot = truth.shot(level)
+
+        def figures(method: str, shot: Shot = shot, truth: ladder.Truth = truth) -> list[float]:
+            images = ladder.denoise(shot, method)
+            return [*truth.judge(shot, images), *_at_rims(truth, images), *truth.frames(images)]
+
+        for method in NAMES:
+            record.add("second", f"{name} {level} {method}", partial(figures, method))
+
+
+def _at_rims(truth: ladder.Truth, images: list[Array]) -> list[float]:
+    """PSNR of the pixels within two of light beyond `RIM` exposures, and of all others."""
+    errors: list[list[float]] = [[], []]
+    for image, (a, b) in zip(images, truth.references, strict=True):
+        light = channel_mean((a + b) / 2)
+        lamp = (light > RIM * measure_exposure(a, b)).astype(np.uint8)
+        rim = cv2.dilate(lamp, np.ones((5, 5), np.uint8)) > 0
+        for found, region in zip(errors, (rim, ~rim), strict=True):
+            shown = np.where(region[..., None], image, a)  # without an error elsewhere
+            found.append(10 ** (-psnr(shown, (a, b)) / 10) / region.mean())
+    return [round(float(-10 * np.log10(np.mean(found))), 3) for found in errors]
 
 
 def measure_blender(record: Record, options: argparse.Namespace) -> None:
@@ -360,8 +387,21 @@ def shots(results: Results) -> str:
 def second(results: Results) -> str:
     """Results: the second ladder."""
     keys = {f"*{name}*, {n} samples": f"{name} {level}" for name in SECOND for level, n in SECOND_LEVELS.items()}
-    rows = ([shot, *(_pair(results["second"][f"{key} {m}"]) for m in NAMES)] for shot, key in keys.items())
+    rows = ([shot, *(_pair(results["second"][f"{key} {m}"][:2]) for m in NAMES)] for shot, key in keys.items())
     return _rows(("shot", *NAMES.values()), rows)
+
+
+def rims(results: Results) -> str:
+    """Results: gains over OIDN best on the second ladder, by region and of the worst frame."""
+    rows = []
+    for name, method in product(SECOND, ("balanced", "quality")):
+        row = [f"*{name}*, {NAMES[method]}"]
+        for level in SECOND_LEVELS:
+            own, best = (results["second"][f"{name} {level} {m}"][2:] for m in (method, RIVALS[method]))
+            at_rims, elsewhere, *frames = (a - b for a, b in zip(own, best, strict=True))
+            row.append(_pair((at_rims, elsewhere, min(frames)), signed=True))
+        rows.append(row)
+    return _rows(("shot", *(f"{count} samples" for count in SECOND_LEVELS.values())), rows)
 
 
 def _blender_gains(results: Results, level: str, method: str) -> dict[str, list[float]]:
@@ -419,6 +459,7 @@ BLOCKS: dict[str, tuple[Callable[[Results], str], tuple[str, ...]]] = {
     "samples": (samples, ("ladder",)),
     "shots": (shots, ("ladder",)),
     "second": (second, ("second",)),
+    "rims": (rims, ("second",)),
     "blender": (blender, ("blender",)),
     "default_settings": (default_settings, ("blender",)),
     "filters": (filters, ("filters",)),

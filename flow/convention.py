@@ -193,8 +193,10 @@ class _Trials:
 
     def worth(self, reading: MotionConvention, share: float) -> bool:
         """Whether a convention explains this share of what an estimated flow does."""
-        explained, all_that_is = self.left(None) - self.left(reading), self.left(None)
-        return explained >= share * all_that_is or explained >= share * (all_that_is - self.search())
+        change = self.left(None)
+        explained = change - self.left(reading)
+        # A flow explains no more than all; the search for it takes seconds.
+        return explained >= share * change or explained >= share * (change - self.search())
 
     def read(self, assumed: MotionConvention, settled: frozenset[str], typed: frozenset[str]) -> MotionConvention:
         """The best convention with the settled parts, or one that overrules those settled parts that are not typed."""

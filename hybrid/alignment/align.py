@@ -141,12 +141,7 @@ def _align_denoised(
     estimates, interpolation = _warp_first_pass(window, first_pass, coverage, rows, timings)
     along_surfaces = None
     if window.reflecting is not None and "blend-samples" in stages and not moves_over_noise(stages):
-        along_surfaces = estimates.copy()
-        if (found := np.flatnonzero(window.reflecting[rows].any(axis=1))).size:
-            part = slice(int(found[0]), int(found[-1]) + 1)
-            those, surfaces = slice(rows.start + part.start, rows.start + part.stop), replace(window, reflections=None)
-            given = surfaces, first_pass, coverage[:, part], those, timings
-            along_surfaces[:, part] = _warp_first_pass(*given, weigh=False)[0]
+        along_surfaces = _warp_along_surfaces(window, first_pass, estimates, coverage, rows, timings)
         along_surfaces /= aligned.modulation
     with timings.stage("confidence"):
         pictures, complete = [estimates, *aligned.aovs.values()], aligned.confidence[middle].all()
@@ -426,6 +421,24 @@ def _warp_first_pass(
             fill_uncovered(warped[index], middle[rows], coverage[index])
         window.release()
     return warped, weights
+
+
+def _warp_along_surfaces(
+    window: Window,
+    first_pass: Sequence[Array | None],
+    along_light: Array,
+    coverage: Array,
+    rows: slice,
+    timings: Timings,
+) -> Array:
+    """Warp first passes by the links alone, (T, h, W, 3): `along_light` but where light moves beside these."""
+    assert window.reflecting is not None
+    warped, moving = along_light.copy(), np.flatnonzero(window.reflecting[rows].any(axis=1))
+    if moving.size:
+        some = slice(int(moving[0]), int(moving[-1]) + 1)
+        of_frame, surfaces = slice(rows.start + some.start, rows.start + some.stop), replace(window, reflections=None)
+        warped[:, some], _ = _warp_first_pass(surfaces, first_pass, coverage[:, some], of_frame, timings, weigh=False)
+    return warped
 
 
 def _fill_centre(pictures: Iterable[Array], confidence: Array) -> None:
