@@ -185,7 +185,7 @@ class Patches:
         """Costs of the patches `at`: centre and neighbour are the frames of these indices, `order`."""
         centre, other = (self.pictures[index] for index in order)
         own_lit, other_lit = ((shown or self.shown)[index] for index in order)
-        difference = np.empty(len(at), np.float32)
+        difference, flow = np.empty(len(at), np.float32), np.ascontiguousarray(flow, np.float32)
         _compare(centre, other, own_lit, other_lit, flow, unit, self.rows[at], self.columns[at], difference)
         return np.asarray(np.minimum(np.square(difference / self.scale[at]), 1))
 
