@@ -138,6 +138,10 @@ def _align_denoised(
     # Few denoisers read the colors of all frames: these are warped when they are read.
     aligned, _, coverage = _align_by_geometry(window, (), rows, inner, timings)
     sources, irradiance, exposure = aligned.sources, aligned.centre.irradiance, aligned.brightness.exposure
+    filtered_guides = None
+    if window.filtered_guides is not None:
+        with timings.stage("confidence"):
+            filtered_guides = average_guides(window.filtered_guides, sources.flows, aligned.confidence, rows)
     estimates, interpolation = _warp_first_pass(window, first_pass, coverage, rows, timings)
     along_surfaces = None
     if window.reflecting is not None and "blend-samples" in stages and not moves_over_noise(stages):
@@ -172,7 +176,9 @@ def _align_denoised(
             pull_to_centre(estimates, confidence, pull)
     return replace(
         aligned,
-        centre=replace(aligned.centre, irradiance=irradiance, first_pass=first_pass[middle]),
+        centre=replace(
+            aligned.centre, irradiance=irradiance, filtered_guides=filtered_guides, first_pass=first_pass[middle]
+        ),
         neighbours=replace(aligned.neighbours, samples=samples, drift_weight=drift_weight),
         confidence=confidence,
         first_pass=estimates,
@@ -337,21 +343,16 @@ def _align_by_geometry(
     flows = [None if link is None else link.forward.vectors[rows] for link in window.links]
     given = window.frames, flows, light_flows, window.first_pass or (), window.limited, rows
     sources = WarpSources(*given, release=window.release)
-    modulation, clean_albedo, filtered = np.ones((*shape[1:], 3), np.float32), None, None
+    modulation, clean_albedo = np.ones((*shape[1:], 3), np.float32), None
     with timings.stage("confidence"):
-        if window.filtered_guides is not None:
-            filtered = average_guides(window.filtered_guides, flows, confidence, rows)
         if "albedo" in guides:
-            if filtered is not None and "prefilter" in stages:
-                clean_albedo = filtered["albedo"]
-            else:
-                clean_albedo = clean_guide("albedo", guides, sources, confidence, stages)
+            clean_albedo = clean_guide("albedo", guides, sources, confidence, stages)
             if centre.demodulated:
                 modulation = remodulate(modulation, clean_albedo)
                 sources = replace(sources, modulation=modulation if "prefilter" in stages else None)
         brightness = window.lit.as_light if "light" in names else window.lit.as_rendered
     aligned = AlignedWindow(
-        centre=Centre(centre, centre.irradiance[rows], guides, clean_albedo, filtered),
+        centre=Centre(centre, centre.irradiance[rows], guides, clean_albedo),
         neighbours=Neighbours((geometry[count // 2 - 1], geometry[count // 2 + 1]) if count > 1 else (None, None)),
         sources=sources,
         stages=stages,
