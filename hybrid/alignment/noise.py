@@ -41,7 +41,7 @@ PLACE = 16
 # Ratio of samples from which on two frames differ in these places: by this measure frames of equal samples differ by up
 # to 1.7, and those of four times as many by 1.9 to 8.4.
 UNEQUAL = 3.0
-# Share of the picture that must move by whole pixels for that: 1.6 % of vectors of any length end there by chance.
+# Outlines are compared if this share of the picture moves by whole pixels: 1.6 % of vectors of any length do by chance.
 WHOLE_PIXELS = 0.05
 # Deviation, pixels, of the Gaussian mean of the ratio of light by which two frames are made equal before their noise is
 # compared.

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from hybrid.alignment.align import _warp_along_surfaces, _warp_first_pass
 from hybrid.denoising.denoisers import AverageDenoiser
 from hybrid.denoising.first_pass import PerFrame
 from hybrid.denoising.plan import DENOISED, NOISY, Rules
@@ -107,3 +108,19 @@ def test_guides_stay_on_their_surface_and_aovs_move_with_the_light(tmp_path):
         env = aligned.aovs["ViewLayer.Env"][t]
         assert np.abs(env - 4 * near(3)[..., None])[inside].mean() < 0.4
         assert np.abs(aligned.albedo[t] - aligned.albedo[2])[inside].max() < 1e-3
+
+
+@pytest.mark.parametrize("rows", [slice(0, WALL.height), slice(20, 50), slice(64, 72)])
+def test_samples_are_judged_along_surfaces(tmp_path, rows):
+    """First passes are warped anew in the rows where light moves, and nowhere else."""
+    stream = FrameStream(open_shot(WALL.write(tmp_path, edit=shine)), RULES, first_pass=FIRST_PASS)
+    stream.keep(stream.around(MIDDLE, stream.support))
+    window = stream.window(MIDDLE)
+    assert window.reflecting[20:50].any()
+    shape = len(window.frames), rows.stop - rows.start, WALL.width
+    given = window.first_pass, np.ones(shape, np.float32), rows, Timings()
+    along_light, _ = _warp_first_pass(window, *given, weigh=False)
+    expected, _ = _warp_first_pass(replace(window, reflections=None), *given, weigh=False)
+    assert (along_light == expected).all() != window.reflecting[rows].any()
+    found = _warp_along_surfaces(window, given[0], along_light, *given[1:])
+    np.testing.assert_array_equal(found, expected)
