@@ -264,11 +264,11 @@ def measure_blender(record: Record, options: argparse.Namespace) -> None:
             record.add("blender", f"{name} {level} {method}", partial(figures, method))
 
 
-def spread(folder: Path, out: Path, radius: float) -> None:
-    """Write the shot of a folder at 32 samples, and its references, as a pixel filter [r 1 r] shows them."""
+def spread(folder: Path, out: Path, radius: float, names: Iterable[str]) -> None:
+    """Write the frames of some names in a folder as a pixel filter [r 1 r] shows them."""
     kernel = np.array([radius, 1, radius], np.float32) / np.float32(1 + 2 * radius)
     out.mkdir(parents=True, exist_ok=True)
-    for path in sorted([*folder.glob("s032.*.exr"), *folder.glob("reference_?.*.exr")]):
+    for path in (path for name in names for path in sorted(folder.glob(f"{name}.*.exr"))):
         image = read_exr(path)
         layers = {layer.name: image.pixels(layer.channels) for layer in image.layers}
         for name, layer in layers.items():
@@ -283,7 +283,7 @@ def measure_filters(record: Record, options: argparse.Namespace) -> None:
     for name, radius in product(FILTERED, RADII):
         if f"{name} {radius} quality" not in record.values.get("filters", {}):
             with tempfile.TemporaryDirectory() as folder:
-                spread(find_shot(name, options), Path(folder), radius)
+                spread(find_shot(name, options), Path(folder), radius, ("s032", "reference_a", "reference_b"))
                 judge(record, "filters", f"{name} {radius}", ladder.Truth(Path(folder)), "s032", NAMES)
 
 

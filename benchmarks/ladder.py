@@ -43,7 +43,7 @@ MOST = 65.0
 
 
 def denoise(shot: Shot, method: str, **options: object) -> list[Array]:
-    """The frames of a shot by a method; options are those of `denoise_shot`."""
+    """The frames of a shot by a method or a file of weights; options are those of `denoise_shot`."""
     frames = [shot.read(number) for number in shot.numbers]
     if method == "noisy":
         return [frame.color for frame in frames]
@@ -51,9 +51,10 @@ def denoise(shot: Shot, method: str, **options: object) -> list[Array]:
         return [frame.estimate for frame in frames]  # type: ignore
     if method in OIDN:
         return [denoise_oidn(f.color, f.albedo, f.normal, prefilter=OIDN[method]) for f in frames]  # type: ignore
+    chosen = NOISY_ALONE.get(method, {"weights" if method.endswith(".safetensors") else "preset": method})
     with tempfile.TemporaryDirectory() as folder:
         pattern = f"{folder}/frame.####.exr"
-        list(denoise_shot(shot, pattern, **NOISY_ALONE.get(method, {"preset": method}), **options))  # type: ignore
+        list(denoise_shot(shot, pattern, **chosen, **options))  # type: ignore
         made = open_shot(pattern)
         frames = [made.read(number) for number in shot.numbers]
     # Files that keep the noisy image beside the denoised one are read as it.

@@ -8,6 +8,7 @@ from network.presets import PRESETS, build_preset
 def test_presets_are_models_of_any_window_length(name: str) -> None:
     sizes = {"fast": 4_300, "balanced": 930_000, "quality": 3_900_000, "unet": 250_000, "multiscale": 1_700_000}
     sizes |= {"paper": 3_600_000, "paper-tkpcn": 3_400_000, "ra": 580_000, "tkpcn": 580_000}
+    sizes |= {"ra-small": 150_000, "tkpcn-small": 150_000, "ra-small-scales": 160_000}
     for frames in (3, 5):
         model = build_preset(name, frames, seed=1)
         assert model.frames == frames
@@ -28,6 +29,7 @@ def test_without_a_length_windows_are_as_long_as_usual() -> None:
     assert [build_preset(name).frames for name in ("fast", "quality")] == [5, 7]
 
 
-def test_the_papers_network_and_its_baseline_are_of_equal_size() -> None:
-    ra, baseline = (sum(p.numel() for p in build_preset(name).parameters()) for name in ("ra", "tkpcn"))
+@pytest.mark.parametrize("size", ["", "-small"])
+def test_the_papers_network_and_its_baseline_are_of_equal_size(size: str) -> None:
+    ra, baseline = (sum(p.numel() for p in build_preset(name + size).parameters()) for name in ("ra", "tkpcn"))
     assert baseline == pytest.approx(ra, rel=0.02)
