@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hybrid.alignment.measure import FrameFacts, PairFacts, least_outline_noise
-from hybrid.alignment.noise import FIXED_NOISE_ABOVE, STILL, Correlation
+from hybrid.alignment.noise import FIXED_NOISE_ABOVE, STILL, Correlation, near_correlation
 from hybrid.files.sequences import format_frames
 
 #: Stages by name, in order. A figure calls for some; others (`_switch`) run wherever their input is there.
@@ -289,7 +289,7 @@ def _decide_lags(lags: Correlation, alone: float | None) -> Decision:
             return Decision("whiten", False, None, WHITEN_ALONE_ABOVE, f"single frames may have no noise: {wide}")
         reason = "the noise of neighbouring pixels correlates by {:.2f} in three quarters of single frames"
         return _decide("whiten", alone, WHITEN_ALONE_ABOVE, reason)
-    near = min(along[0] for along in lags)
+    near = near_correlation(lags)
     decision = _decide("whiten", near, WHITEN_ABOVE, "the noise of neighbouring pixels correlates by {:.2f}")
     if not decision.on or far < WHITEN_BELOW:
         return decision

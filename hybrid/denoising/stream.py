@@ -33,9 +33,11 @@ from hybrid.alignment.noise import (
     Correlation,
     correlation_alone,
     fixed_noise,
+    near_correlation,
     noise_correlation,
     relative_residual,
     shared_residual,
+    without_moving_light,
 )
 from hybrid.alignment.prepare import PreparedFrame, prepare, prepared_planes, without_filter
 from hybrid.alignment.residual import Limited, measure_limited
@@ -345,18 +347,25 @@ class FrameStream:
     def _correlation(self, number: int) -> tuple[Correlation | None, float | None]:
         """The correlation of a frame's noise by its difference to the frame before; without one, to the one after.
 
-        Without both it is that of `correlation_alone`, with its lower quartile.
+        Light that moves adds to it, and detail of the light to that of `correlation_alone`: where the first shows a
+        filter, the second has to show it too. Without both it is that of the frame alone, with its lower quartile.
         """
         if "whiten" not in self.rules.allowed:
             return None, None
         before, _, after = self.around(number, 1)
+        found: Correlation | None = None
         for pair in ((before, number), (number, after)):
-            if all(map(self.shot.has, pair)):
-                found: Correlation | None = self._cached("correlation", pair, self._measure_correlation)
-                if found is not None:
-                    return found, None
+            if found is None and all(map(self.shot.has, pair)):
+                found = self._cached("correlation", pair, self._measure_correlation)
+        if found is not None and not self.rules.whitens(found):
+            return found, None
         alone = self._cached("correlation alone", (number,), self._measure_alone)
-        return (None, None) if alone is None else alone
+        if found is None:
+            return (None, None) if alone is None else alone
+        if alone is None:
+            return found, None
+        lesser = min(found, alone[0], key=near_correlation)
+        return without_moving_light(found, alone[0]) if self.rules.whitens(lesser) else lesser, None
 
     def _measure_alone(self, number: int) -> tuple[Correlation, float] | None:
         frame = self._raw(number)

@@ -6,7 +6,7 @@ import socket
 import sys
 import threading
 from _thread import interrupt_main
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 
 from hybrid.files.replace import remove_unfinished
@@ -46,18 +46,24 @@ def is_interrupt(error: BaseException | None) -> bool:
 
 
 @contextmanager
-def terminable() -> Iterator[None]:
-    """Treat SIGTERM, and Ctrl-Break, as Ctrl-C."""
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
-        yield
+def _as_ctrl_c(numbers: Iterable[int]) -> Iterator[bool]:
+    """Treat signals as Ctrl-C; False, and nothing done, outside the main thread, which alone may handle signals."""
+    if threading.current_thread() is not threading.main_thread():
+        yield False
         return
-    numbers = [number for number in INTERRUPTS if number != signal.SIGINT]
     before = {number: signal.signal(number, signal.default_int_handler) for number in numbers}
     try:
-        yield
+        yield True
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def terminable() -> Iterator[None]:
+    """Treat SIGTERM, and Ctrl-Break, as Ctrl-C."""
+    with _as_ctrl_c(number for number in INTERRUPTS if number != signal.SIGINT):
+        yield
 
 
 @contextmanager
@@ -68,9 +74,17 @@ def interruptible(report: Callable[[], None]) -> Iterator[None]:
     If no KeyboardInterrupt has left the block in `PATIENCE` seconds, a thread removes unfinished files, calls `report`
     and ends the process. `report` logs what is finished; it is called once, and KeyboardInterrupt is raised again.
     """
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
-        yield
-        return
+    with _as_ctrl_c(INTERRUPTS) as handled:
+        if handled:
+            with _watched(report):
+                yield
+        else:
+            yield
+
+
+@contextmanager
+def _watched(report: Callable[[], None]) -> Iterator[None]:
+    """End the process where KeyboardInterrupt does not leave the block in time; `report` is called once."""
     ours, theirs = socket.socketpair()
     theirs.setblocking(False)
     left = threading.Event()
@@ -92,7 +106,6 @@ def interruptible(report: Callable[[], None]) -> Iterator[None]:
             remove_unfinished()  # files that a thread began to write during the report
             os._exit(INTERRUPTED)
 
-    before = {number: signal.signal(number, signal.default_int_handler) for number in INTERRUPTS}
     # The C-level signal handler writes to it at once.
     previous = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
     watcher = threading.Thread(target=watch, daemon=True)
@@ -108,8 +121,6 @@ def interruptible(report: Callable[[], None]) -> Iterator[None]:
     finally:
         left.set()
         signal.set_wakeup_fd(previous)
-        for number, handler in before.items():
-            signal.signal(number, handler)
         theirs.send(b"\0")  # ends the watcher
         watcher.join()
         ours.close()
