@@ -39,14 +39,13 @@ from bench_shot import REPEAT, measure, write_shot
 
 from hybrid.alignment.transfer import measure_exposure
 from hybrid.comparison.metrics import psnr
-from hybrid.files.exr import read_exr
+from hybrid.files.exr import read_exr, write_exr
 from hybrid.files.frame import Array
 from hybrid.files.movies import write_movie
 from hybrid.files.png import display_exposure, encode_bytes, write_label, write_png
 from hybrid.files.shots import Shot
 from nlm.average import channel_mean
 from ravg import open_shot
-from tests.exr_files import write_layers
 
 ROOT = Path(__file__).resolve().parent.parent
 CODE = ("flow", "hybrid", "loops", "network", "nlm", "setup.cfg", "constraints.txt")
@@ -269,12 +268,14 @@ def spread(folder: Path, out: Path, radius: float, names: Iterable[str]) -> None
     kernel = np.array([radius, 1, radius], np.float32) / np.float32(1 + 2 * radius)
     out.mkdir(parents=True, exist_ok=True)
     for path in (path for name in names for path in sorted(folder.glob(f"{name}.*.exr"))):
-        image = read_exr(path)
-        layers = {layer.name: image.pixels(layer.channels) for layer in image.layers}
-        for name, layer in layers.items():
-            if name.rpartition(".")[2] in LIGHT or len(layers) == 1:
-                layers[name] = cv2.sepFilter2D(layer, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)
-        write_layers(out / path.name, layers)
+        image, replaced = read_exr(path), {}
+        for layer in image.layers:
+            if layer.name.rpartition(".")[2] in LIGHT or len(image.layers) == 1:
+                pixels = image.pixels(layer.channels)
+                spread_out = cv2.sepFilter2D(pixels, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)
+                planes = np.moveaxis(spread_out.reshape(pixels.shape), -1, 0)
+                replaced |= dict(zip(layer.channels, planes, strict=True))
+        write_exr(out / path.name, image, replaced)
 
 
 def measure_filters(record: Record, options: argparse.Namespace) -> None:
