@@ -20,6 +20,9 @@ AREAS = 4, 6
 # moves, and less than 0.5 for 73 of 80 fades by 0.7. Factors of three channels are chosen where they leave less than
 # `LEFT` of what one factor leaves.
 LEFT, LEFT_SLIGHT = 0.5, 0.25
+# Logarithm of a change beyond which no more may be left: that of fades by 0.7, by which the shares are chosen. A lamp
+# that is switched on lights most of a room 6 times, and leaves a third of it.
+MOST_LEFT = 0.36
 # Logarithm of a fade that is slight: under one of 1.5 % that left 0.4 of the changes, a textured object in other light
 # lost 1.5 dB where the noise is 1 %.
 SLIGHT = 0.1
@@ -56,7 +59,7 @@ def find_factors(first: Array, second: Array, compared: Mask, noise: Array | Non
     cells = _lit_cells(lit)
     changes, factors = _choose_factors(first, second, mean, lit, cells)
     left, size = _upper_quartile(changes - factors), float(np.abs(factors).max())
-    explains = left < (LEFT_SLIGHT if size < SLIGHT else LEFT) * _upper_quartile(changes)
+    explains = left < (LEFT_SLIGHT if size < SLIGHT else LEFT) * min(_upper_quartile(changes), MOST_LEFT)
     if not explains and noise is not None and size > max(LEAST_FADE, KNOWN * left / np.sqrt(len(changes))):
         noise, light = (noise, first) if len(factors) == 3 else (channel_mean(noise)[..., None], mean[..., None])
         explains = left < EXPLAINED * _median_error(noise, light, lit, cells)

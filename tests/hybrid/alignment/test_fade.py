@@ -29,6 +29,14 @@ def test_light_that_changes_in_half_of_the_picture_is_no_fade():
     assert (measure_fade(noisy(1), changed, EVERYWHERE) == 1).all()
 
 
+@pytest.mark.parametrize("uneven", [1.0, 4.0])
+def test_a_lamp_that_is_switched_on_is_no_fade(uneven):
+    """It lights one side more; taken for a fade its pattern of light was a ghost in the frame before, 4 dB worse."""
+    lamp = np.float32(6) * np.geomspace(1 / uneven, 1, SHAPE[0], dtype=np.float32)[:, None, None]
+    found = measure_fade(noisy(1), noisy(2) * lamp, EVERYWHERE)
+    assert found == pytest.approx((6, 6, 6) if uneven == 1 else NO_FADE, rel=0.02)
+
+
 def test_noise_alone_is_no_fade():
     assert measure_fade(noisy(1), noisy(2), EVERYWHERE) == pytest.approx(NO_FADE)
 
