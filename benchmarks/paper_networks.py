@@ -2,7 +2,7 @@
 
     python benchmarks/paper_networks.py filter SHOT [SHOT ...] OUT
     python benchmarks/paper_networks.py train CLIPS OUT --validation SHOT,SHOT [--steps 1200]
-    python benchmarks/paper_networks.py judge OUT SHOT [SHOT ...] --clips CLIPS --validation SHOT,SHOT
+    python benchmarks/paper_networks.py judge CLIPS OUT SHOT [SHOT ...] --validation SHOT,SHOT
 
 The first command writes shots to train on as a pixel filter shows them, whose pixels share noise. `CLIPS` is a folder
 of `ravg make-clips --tile 64`. The second trains two networks at a time, on one processor each, and continues what was
@@ -16,7 +16,6 @@ import argparse
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import product
 from pathlib import Path
@@ -40,8 +39,6 @@ from network.training.loop import predict
 NETWORKS = ("ra-small", "tkpcn-small")
 TERMS = ("temporal", "spatial")
 SEEDS = (0, 1)
-#: The paper's network with kernels at three resolutions is trained once.
-SCALES = ("ra-small-scales", "temporal", 0)
 SETTINGS = "--batch 4 --crop 64 --loss display --whole 6 --clip 0.1 --ema 0.997 --threads 1 --validate-minutes 4"
 MEASURES = ("PSNR", "temporal PSNR", "SSIM", "FLIP")
 
@@ -53,17 +50,11 @@ def filter_shots(options: argparse.Namespace) -> None:
         figures.spread(folder, options.out / f"{folder.name}_filtered", radius, ladder.levels(folder))
 
 
-def trainings() -> Iterator[tuple[str, str, int]]:
-    """Network, terms of the loss and seed of each training, in an order that gives a comparison early."""
-    yield from ((network, terms, seed) for seed, terms, network in product(SEEDS, TERMS, NETWORKS))
-    yield SCALES
-
-
 def train(options: argparse.Namespace) -> None:
     """Train all networks, two at a time."""
 
-    def run(training: tuple[str, str, int]) -> None:
-        network, terms, seed = training
+    def run(training: tuple[int, str, str]) -> None:
+        seed, terms, network = training
         out = options.out / f"{network}.{terms}.{seed}.safetensors"
         state = Path(f"{out}.state")
         if out.exists() and not state.exists():
@@ -76,7 +67,7 @@ def train(options: argparse.Namespace) -> None:
 
     options.out.mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(2) as pool:
-        list(pool.map(run, trainings()))
+        list(pool.map(run, product(SEEDS, TERMS, NETWORKS)))  # a comparison comes early
 
 
 def cut(weights: Path, out: Path) -> bool:
@@ -117,7 +108,7 @@ def judge(options: argparse.Namespace) -> None:
     """Measure all networks and print tables."""
     path = options.out / "figures.json"
     measured = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    files = sorted(options.out.glob("*.safetensors"))
+    files = [path for path in sorted(options.out.glob("*.safetensors")) if not Path(f"{path}.state").exists()]
     (options.out / "cut").mkdir(exist_ok=True)
     for weights in files:
         if (key := f"weights {weights.stem}") not in measured:
@@ -169,9 +160,9 @@ def main() -> int:
     training.add_argument("--steps", type=int, default=1200)
     training.set_defaults(run=train)
     judging = commands.add_parser("judge")
+    judging.add_argument("clips", type=Path)
     judging.add_argument("out", type=Path)
     judging.add_argument("shots", nargs="+", type=Path)
-    judging.add_argument("--clips", type=Path, required=True)
     judging.set_defaults(run=judge)
     for command in (training, judging):
         command.add_argument("--validation", required=True, help="names of shots, with commas between")

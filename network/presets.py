@@ -39,15 +39,13 @@ PRESETS: dict[str, Preset] = {
     "quality": Preset(lambda frames: RobustUNet(RobustUNetConfig(frames, "large", clean_guides=True)), frames=7),
     # From noisy frames alone: a small U-Net of 0.24 M parameters; a four-scale U-Net with RA blocks at every scale and
     # kernels at three resolutions; the paper's network and its baseline with blocks of width 32 and 0.57 M parameters,
-    # equal within 1 %; both with width 16 and 0.15 M, and the first of these with kernels at three resolutions; both
-    # with the paper's width of 80.
+    # equal within 1 %; both with width 16 and 0.15 M; both with the paper's width of 80.
     "unet": Preset(lambda frames: paper.RAUNet(paper.RAUNetConfig(paper.KernelConfig(frames)))),
     "multiscale": Preset(_multiscale),
     "ra": Preset(lambda frames: paper.RAResNet(_ra(frames, 32))),
     "tkpcn": Preset(lambda frames: paper.TKPCN(_tkpcn(frames, 32))),
     "ra-small": Preset(lambda frames: paper.RAResNet(_ra(frames, 16))),
     "tkpcn-small": Preset(lambda frames: paper.TKPCN(_tkpcn(frames, 16))),
-    "ra-small-scales": Preset(lambda frames: paper.MultiScale(paper.MultiScaleConfig(_ra(frames, 16)))),
     "paper": Preset(lambda frames: paper.RAResNet(paper.RAResNetConfig(paper.KernelConfig(frames)))),
     "paper-tkpcn": Preset(lambda frames: paper.TKPCN(paper.TKPCNConfig(paper.KernelConfig(frames)))),
 }
