@@ -105,6 +105,7 @@ RIVALS = {"fast": "oidn-high", "balanced": "oidn-best", "quality": "oidn-best"}
 # Shots whose noise is correlated by the kernel [r 1 r] in both directions, at 32 samples.
 FILTERED = ("classroom", "staircase")
 RADII = (0.1, 0.2, 0.3, 0.45)
+SPREAD = ("s032", "reference_a", "reference_b")
 # Shots of other renderers (`benchmarks/other_renderers.py`): level and options of each.
 OTHERS: dict[str, tuple[str, ...]] = {
     "mitsuba": ("s032", "mitsuba"),
@@ -284,7 +285,7 @@ def measure_filters(record: Record, options: argparse.Namespace) -> None:
     for name, radius in product(FILTERED, RADII):
         if f"{name} {radius} quality" not in record.values.get("filters", {}):
             with tempfile.TemporaryDirectory() as folder:
-                spread(find_shot(name, options), Path(folder), radius, ("s032", "reference_a", "reference_b"))
+                spread(find_shot(name, options), Path(folder), radius, SPREAD)
                 judge(record, "filters", f"{name} {radius}", ladder.Truth(Path(folder)), "s032", NAMES)
 
 
@@ -533,7 +534,7 @@ def draw_filter(options: argparse.Namespace) -> None:
     """README: *classroom* with the filter r = 0.3, 32 samples."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        spread(find_shot("classroom", options), folder, 0.3)
+        spread(find_shot("classroom", options), folder, 0.3, SPREAD)
         truth = ladder.Truth(folder)
         shot = truth.shot("s032")
         images = {method: ladder.denoise(shot, method)[1] for method in ("noisy", "oidn-best", "balanced")}
