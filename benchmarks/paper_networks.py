@@ -77,7 +77,8 @@ def cut(weights: Path, out: Path) -> bool:
     for block in blocks:
         torch.nn.init.zeros_(block.weight.weight)
         torch.nn.init.constant_(block.weight.bias, -30)  # the share of the average, e^-30, vanishes in float32
-    save_model(out, model)
+    if blocks:
+        save_model(out, model)
     return bool(blocks)
 
 
@@ -109,7 +110,9 @@ def judge(options: argparse.Namespace) -> None:
     path = options.out / "figures.json"
     measured = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     files = [path for path in sorted(options.out.glob("*.safetensors")) if not Path(f"{path}.state").exists()]
+    first = [weights for weights in files if weights.stem.endswith("temporal.0")]
     (options.out / "cut").mkdir(exist_ok=True)
+    without = {weights: out for weights in first if cut(weights, out := options.out / "cut" / weights.name)}
     for weights in files:
         if (key := f"weights {weights.stem}") not in measured:
             measured[key] = frame_weights(weights, options.clips, options.validation.split(","))
@@ -122,10 +125,10 @@ def judge(options: argparse.Namespace) -> None:
             }
             for weights in files:
                 runs[weights.stem] = (str(weights), {})
-                if weights.stem.endswith("temporal.0"):
+                if weights in first:
                     runs[f"{weights.stem} unwarped"] = (str(weights), {"no_stages": ["warp"]})
-                    if cut(weights, without := options.out / "cut" / weights.name):
-                        runs[f"{weights.stem} cut"] = (str(without), {})
+                if weights in without:
+                    runs[f"{weights.stem} cut"] = (str(without[weights]), {})
             for name, (method, settings) in runs.items():
                 if (key := f"{folder.name} {level} {name}") not in measured:
                     measured[key] = measure(truth, shot, method, **settings)
