@@ -1,7 +1,7 @@
 """The paper's network and its baseline at a small size: both losses, two seeds, trained and judged alike.
 
     python benchmarks/paper_networks.py filter SHOT [SHOT ...] OUT
-    python benchmarks/paper_networks.py train CLIPS OUT --validation SHOT,SHOT [--steps 1200]
+    python benchmarks/paper_networks.py train CLIPS OUT --validation SHOT,SHOT [--steps 1000]
     python benchmarks/paper_networks.py judge CLIPS OUT SHOT [SHOT ...] --validation SHOT,SHOT
 
 The first command writes shots to train on as a pixel filter shows them, whose pixels share noise. `CLIPS` is a folder
@@ -160,7 +160,7 @@ def main() -> int:
     training = commands.add_parser("train")
     training.add_argument("clips", type=Path)
     training.add_argument("out", type=Path)
-    training.add_argument("--steps", type=int, default=1200)
+    training.add_argument("--steps", type=int, default=1000)
     training.set_defaults(run=train)
     judging = commands.add_parser("judge")
     judging.add_argument("clips", type=Path)
