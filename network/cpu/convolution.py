@@ -10,8 +10,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from network.cpu.winograd import can_transform, convolve_transformed
-
 # Types for which oneDNN has the fused operation on this processor; none where torch was built without oneDNN.
 _FUSED: frozenset[torch.dtype] = frozenset()
 if torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_convolution_pointwise"):
@@ -30,8 +28,6 @@ def convolve(x: Tensor, weight: Tensor, bias: Tensor | None, added: Tensor | Non
     if not can_fuse(x):
         result = functional.conv2d(x, weight, bias, padding=1)
         return torch.relu_(result if added is None else added.add_(result))
-    if can_transform(x, weight):
-        return convolve_transformed(x, weight, bias, added, relu=True)
     one, rest = [1, 1], ("relu", list[float](), "")
     operation = weight, bias, one, one, one, 1  # padding, stride and dilation; groups
     if added is None:

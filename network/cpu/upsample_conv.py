@@ -14,8 +14,6 @@ from torch.nn import functional
 
 from loops.parallel import run_bands
 from network.cpu.convolution import convolve
-from network.cpu.vectors import LANES
-from network.cpu.winograd import can_transform, convolve_interleaved
 
 
 class UpsampleTaps(NamedTuple):
@@ -45,8 +43,6 @@ def can_upsample(*layers: Tensor) -> bool:
 def convolve_upsampled(x: Tensor, skip: Tensor, taps: UpsampleTaps, bias: Tensor) -> Tensor:
     """Upsample ``(N, C, H, W)``, concatenate the skip ``(N, D, 2·H, 2·W)``, convolve to O channels, apply a ReLU."""
     count, channels, (height, width) = len(x), len(bias), x.shape[2:]
-    if can_transform(x, taps.coarse) and channels % LANES == 0:
-        return convolve(skip, taps.skip, bias, convolve_interleaved(x, taps.coarse))
     parts = functional.conv2d(x, taps.coarse, padding=1).permute(0, 2, 3, 1).contiguous()
     upsampled = parts.new_empty(count, 2 * height, 2 * width, channels)
     kind = torch.int16 if x.dtype == torch.bfloat16 else torch.int32
