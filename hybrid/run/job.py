@@ -20,6 +20,7 @@ from hybrid.denoising.breakdown import Breakdown, write_breakdown
 from hybrid.denoising.denoisers import AverageDenoiser, ClassicalDenoiser
 from hybrid.denoising.first_pass import (
     NETWORKS,
+    OIDN_MODE_ALONE,
     OIDN_MODE_OF_NETWORKS,
     OIDN_MODES,
     SPECS,
@@ -299,12 +300,13 @@ def choose_first_pass(view: Shot, options: DenoiseOptions, denoiser: WindowDenoi
     if not denoiser.needs_first_pass:
         return FirstPassSource("none", None, "the denoiser takes none")
     support = temporal_support(None, denoiser.radius, options.rules)
+    alone = options.method == "network" and len(view.with_neighbours(1).numbers) == 1
     return find_first_pass(
         "nlm" if options.first_pass == "none" else options.first_pass,  # the denoiser needs one
         view.with_neighbours(support * (options.passes - 1)),
         classical=CLASSICAL_PRESETS.get(options.preset, FINAL),
         kept=options.keep_first_pass,
-        mode=options.oidn_mode,
+        mode=OIDN_MODE_ALONE if alone else options.oidn_mode,
         forced=options.rules.forced,
         backends=denoiser.backends,
         device=options.device,

@@ -56,6 +56,15 @@ def test_noise_lamps_of_some_size_and_sparks_on_black_are_none():
     assert len(find_fireflies(black)) == 0
 
 
+@pytest.mark.parametrize("light", [200, 20_000])
+def test_a_sample_that_may_be_light_is_a_candidate_and_no_firefly(light):
+    frame = noisy()
+    frame[20, 30] = light
+    places, firefly = find_bright_samples(frame)
+    assert places.tolist() == [[20, 30]]
+    assert firefly.tolist() == [light == 20_000]
+
+
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
 def test_what_is_found_does_not_depend_on_the_scale(scale):
     frame = noisy()

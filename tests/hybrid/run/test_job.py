@@ -20,6 +20,16 @@ from tests.scenes import Scene
 ROOT = Path(__file__).parents[3]
 
 
+@pytest.mark.neural
+@pytest.mark.oidn
+@pytest.mark.parametrize(("frames", "numbers", "mode"), [(1, "1001", "oidn"), (3, "1002", "oidn-fast")])
+def test_a_frame_alone_starts_from_a_better_first_pass(tmp_path, frames, numbers, mode):
+    """No average improves it; a frame of a shot has neighbours, though it is denoised alone."""
+    shot = ravg.open_shot(Scene(height=32, width=48, frames=frames).write(tmp_path / "in"), frames=numbers)
+    (opened,) = job.Job.open(shot, tmp_path / "out", DenoiseOptions(preset="fast")).first_passes
+    assert opened.name == mode
+
+
 def same(made, expected):
     made, expected = ({p.name: read_exr(p) for p in folder.glob("*.exr")} for folder in (made, expected))
     assert made.keys() == expected.keys()
