@@ -207,7 +207,7 @@ def _open(path: str | os.PathLike[str]) -> Iterator[tuple[Any, dict[str, str]]]:
 
 
 def find_weights(name: str) -> Path:
-    """Path of a file of weights, or of those of a preset, ``ra`` or ``tkpcn``; ValueError for another name."""
+    """Path of a file of weights, or of those of a preset or a network for research; ValueError for another name."""
     if Path(name).suffix:
         return Path(name)
     path = RESEARCH / f"{name}.safetensors"

@@ -163,6 +163,7 @@ METHODS: dict[str, Method] = {
     **{preset: _network(preset, OIDN_MODE_OF_NETWORKS) for preset in NETWORKS},
     "RA": _network("ra", "none"),
     "tKPCN": _network("tkpcn", "none"),
+    "RA multiscale": _network("multiscale", "none"),
     "OIDN fast": _oidn("fast"),
     "OIDN high": _oidn("high"),
     "OIDN balanced": _oidn("balanced"),

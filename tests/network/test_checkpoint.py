@@ -127,7 +127,7 @@ def test_older_files_of_the_papers_networks_are_read_and_those_of_the_final_stag
 
 
 def test_networks_of_the_paper_are_weights_by_name_and_no_presets() -> None:
-    for name in ("ra", "tkpcn"):
+    for name in ("ra", "tkpcn", "multiscale"):
         assert find_weights(name).is_file()
         with pytest.raises(ValueError, match=f"preset is '{name}', a network for research, expected --weights {name}"):
             shipped_weights(name)
