@@ -51,8 +51,8 @@ SPECS = ("auto", "none", "nlm", "bundled", *OIDN_MODES)
 # `balanced` 0.5 to 0.6; `quality`, which has that network itself, is 0.3 to 0.5 dB better still.
 NETWORKS = ("fast", "balanced", "quality")
 OIDN_MODE_OF_NETWORKS = "oidn-fast"
-# The same of a frame alone, which no average improves: over "oidn-fast" `fast` gains 0.7 dB, `balanced` 0.2 and
-# `quality` 0.1 (ten shots, 8 and 128 samples).
+# The same of a frame alone, which no average improves: over "oidn-fast" `fast` gains 0.5 dB and `quality` 0.1 (eight
+# shots, 8 and 128 samples).
 OIDN_MODE_ALONE = "oidn"
 
 
