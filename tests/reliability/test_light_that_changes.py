@@ -267,7 +267,7 @@ def test_equal_frames_come_out_equal(tmp_path: Path, preset: str) -> None:
     def equal(fade: float) -> Edit:
         def edit(index: int, layers: Layers) -> None:
             color = grained(layers[COLOR], 5, NOISE)
-            color[np.random.default_rng(3).random(color.shape[:2]) < 0.0005] += 2000
+            color[np.random.default_rng(3).random(color.shape[:2]) < 0.001] += 240
             layers[COLOR] = color * np.float32(fade**index)
 
         return edit

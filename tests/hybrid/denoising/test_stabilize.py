@@ -350,7 +350,7 @@ class TestMean:
 
         def shine(index, layers):
             color = layers["ViewLayer.Combined"] = layers["ViewLayer.Combined"].copy()
-            color[places(index)] = 4000 * self.SCENE.clean(index)["ViewLayer.Combined"][places(index)]
+            color[places(index)] = 1600 * self.SCENE.clean(index)["ViewLayer.Combined"][places(index)]
 
         shot = open_shot(self.SCENE.write(tmp_path / "in", edit=shine))
         aligner = FrameStream(shot, Rules())

@@ -99,7 +99,7 @@ def test_at_the_ends_of_a_shot_the_two_nearest_frames_know_a_lamp(tmp_path, numb
 
 
 def test_a_frame_alone_knows_no_lamp(tmp_path):
-    shot = open_shot(replace(CALM, frames=1).write(tmp_path, edit=shining(0, light=5000)))
+    shot = open_shot(replace(CALM, frames=1).write(tmp_path, edit=shining(0, light=2000)))
     frame = load(shot, [1001])[1001]
     assert (frame.fireflies, frame.highlights) == (1, None)
 
@@ -111,7 +111,7 @@ def test_the_same_noise_once_more_is_no_witness(tmp_path, held):
     def shine(index, layers):
         if held.get(index, index) == 5:
             layers["ViewLayer.Combined"][:] = CALM.noisy(5)["ViewLayer.Combined"]
-            layers["ViewLayer.Combined"][PLACE] = 5000
+            layers["ViewLayer.Combined"][PLACE] = 2000
 
     frame = load(open_shot(CALM.write(tmp_path, edit=shine)), range(1004, 1009))[1006]
     assert (frame.fireflies, frame.highlights) == (1, None)
@@ -145,7 +145,7 @@ def test_dense_fireflies_are_taken_out(tmp_path, vectors):
     scene = replace(CALM, height=96, width=128, frames=3)
 
     def shine(index, layers):
-        layers["ViewLayer.Combined"][rng.random((96, 128)) < 0.001] = 5000
+        layers["ViewLayer.Combined"][rng.random((96, 128)) < 0.001] = 2000
 
     shot = open_shot(scene.write(tmp_path, edit=shine, without=set() if vectors else {"Vector"}))
     frame = load(shot, range(1001, 1004))[1002]
@@ -377,7 +377,7 @@ def write_slow_pan(folder, *, one_seed, denoised=False, sparks=False):
         grain = np.exp(0.4 * (np.sqrt(0.67) * (shared if one_seed else own) + np.sqrt(0.33) * own[::-1]))
         noisy = (wall * grain).astype(np.float32)
         for spark in SPARKS if sparks else ():
-            noisy[spark] = 1000  # as clamped samples, all of one light
+            noisy[spark] = 200  # as clamped samples, all of one light
         pictures = {"Combined": wall, "Noisy Image": noisy} if denoised else {"Combined": noisy}
         layers = {f"ViewLayer.{name}": picture for name, picture in pictures.items()}
         layers["ViewLayer.Vector"] = np.full((96, 128, 4), (-0.4, 0, -0.4, 0), np.float32)
