@@ -305,8 +305,8 @@ def _find(
                         count += 1
             if not peak:
                 continue
-            most, mean = firefly * over_brightest * brightest, firefly * over_mean * total
-            if brightest > 0 and value > most and value * count > mean:
+            above = value / firefly
+            if brightest > 0 and above > over_brightest * brightest and above * count > over_mean * total:
                 found[y, x] = _FIREFLY
                 continue
             rest = total - brightest
